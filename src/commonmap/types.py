@@ -1,0 +1,169 @@
+"""Records that travel between layers. Plain arrays inside, frozen outside, SI units throughout."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.floating[Any]]
+Float32s = NDArray[np.float32]
+Float64s = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+TREE_DEPTH = 16
+"""Levels of an occupancy octree below its root, as in OctoMap."""
+
+KEY_ORIGIN = 1 << (TREE_DEPTH - 1)
+"""The key of the voxel whose lower corner is the origin of the frame."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """Points of one map in one frame, as a reader returns them.
+
+    xyz: (N, 3) float64, metres, z up, in the frame of the file.
+    crs: the coordinate reference system as WKT where the file names one; such a map is level.
+    colour: (N, 3) uint8 red, green, blue where the file has it.
+    intensity: (N,) float32, in the file's own unit, where the file has it.
+    time: (N,) float64, seconds, where the file has it.
+    origin: (N, 3) float32, where the sensor was when it saw the point (ray starts), where known.
+    """
+
+    xyz: Float64s
+    crs: str | None = None
+    colour: NDArray[np.uint8] | None = None
+    intensity: Float32s | None = None
+    time: Float64s | None = None
+    origin: Float32s | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Leaves:
+    """The leaves of an occupancy octree as arrays; a node that is not there is unknown space.
+
+    resolution: edge of the smallest voxel, metres.
+    keys: (N, 3) uint16, key of the leaf's lower corner at the finest level:
+        `key = floor(coordinate / resolution) + 32768`.
+    depth: (N,) uint8, 16 for a smallest voxel; a leaf at depth d is `2**(16 - d)` voxels wide.
+    log_odds: (N,) float32; above 0 is occupied, else free.
+    """
+
+    resolution: float
+    keys: NDArray[np.uint16]
+    depth: NDArray[np.uint8]
+    log_odds: Float32s
+
+    @property
+    def occupied(self) -> Bools:
+        """(N,) bool: the leaf is more likely occupied than not."""
+        return self.log_odds > 0.0
+
+    def sizes(self) -> Float64s:
+        """Return the edge of each leaf in metres, (N,)."""
+        return self.resolution * np.exp2(TREE_DEPTH - self.depth.astype(np.float64))
+
+    def centres(self) -> Float64s:
+        """Return the centre of each leaf in metres, (N, 3), in the frame of the tree."""
+        corner = (self.keys.astype(np.float64) - KEY_ORIGIN) * self.resolution
+        return corner + 0.5 * self.sizes()[:, None]
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """One turn of a lidar, as measured: not deskewed, every point in the sensor frame of its moment.
+
+    xyz: (N, 3) float32 metres, sensor frame (x forward, y left, z up).
+    time: (N,) float64 seconds, on the clock of the log.
+    ring: (N,) uint16, the channel, lowest first.
+    intensity: (N,) float32.
+    stamp: seconds, the time of the first firing of the turn.
+    """
+
+    xyz: Float32s
+    time: Float64s
+    ring: NDArray[np.uint16]
+    intensity: Float32s
+    stamp: float
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Poses of a sensor over time. time: (M,) seconds, rising; T_map_sensor: (M, 4, 4)."""
+
+    time: Float64s
+    T_map_sensor: Float64s
+
+
+@dataclass(frozen=True, eq=False)
+class GridMap:
+    """Layers over one grid. Cell `[i, j]` spans `origin + [i, j] * cell` to `origin + [i+1, j+1]
+    * cell`, half-open: i runs along x, j along y. Unknown is a mask, never a magic number.
+
+    origin: (2,) float64 metres, the lower corner of cell [0, 0], in the frame of the map.
+    cell: edge of a cell, metres.
+    layers: name -> (nx, ny) array, or (n_slabs, nx, ny) for layers cut into height slabs.
+    """
+
+    origin: Float64s
+    cell: float
+    layers: Mapping[str, NDArray[Any]]
+    slab_edges: Float64s | None = None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Cells along x and along y."""
+        first = next(iter(self.layers.values()))
+        return int(first.shape[-2]), int(first.shape[-1])
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        """Return the layer of that name."""
+        return self.layers[name]
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A pose that the search proposes, best first. score: of the metric; overlap: 0 to 1."""
+
+    T_target_source: Float64s
+    score: float
+    overlap: float
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """The answer: where the source map lies in the target's frame, and whether to believe it.
+
+    accepted: the honest yes or no.
+    reason: one sentence that says why.
+    T_target_source: (4, 4), `p_target = T_target_source @ p_source`; None when refused.
+    confidence: 0 to 1, how probable it is that the best pose is right.
+    covariance: (6, 6) of [x, y, z, rotation about x, y, z] in metres and radians, for a small
+        motion applied on the target's side at the source's centre; None when refused.
+    covariance_centre: (3,) the point of the target frame about which the small rotation turns.
+    overlap: share of the source's known cells that fall on known cells of the target.
+    score, decoy_score: of the best pose, and of the best pose of the mirrored source.
+    rivals: other poses worth a look, best first (when refused, the best pose is the first).
+    metric: name of the similarity metric.
+    evidence: named figures behind the verdict.
+    timings: seconds per step.
+    """
+
+    accepted: bool
+    reason: str
+    T_target_source: Float64s | None
+    confidence: float
+    covariance: Float64s | None
+    covariance_centre: Float64s | None
+    overlap: float
+    score: float
+    decoy_score: float
+    rivals: tuple[Candidate, ...]
+    metric: str
+    evidence: Mapping[str, float] = field(default_factory=dict)
+    timings: Mapping[str, float] = field(default_factory=dict)
+    T_level_target: Float64s | None = None
+    T_level_source: Float64s | None = None
