@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,6 +124,37 @@ class GridMap:
         return self.layers[name]
 
 
+class Progress(Protocol):
+    """What a long job calls to say where it is: the step in plain words, and the share done of
+    the step, 0 to 1. A step is told at least once, at its start."""
+
+    def __call__(self, step: str, share: float = 0.0) -> None:
+        """Say that `step` is under way."""
+
+
+def no_progress(step: str, share: float = 0.0) -> None:
+    """Say nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class SearchPicture:
+    """What the search saw, for a picture of it: every value the metric's score at a pose.
+
+    score: (nx, ny), higher is better, over the translations at the best yaw; NaN where the
+        overlap is too small to count.
+    x: (nx,), y: (ny,) metres, the translation of each cell, target frame.
+    yaw: (m,) radians, rising. best_per_yaw: (m,) the best score of each yaw.
+    decoy_best: the best score of the mirrored source over all poses.
+    """
+
+    score: Floats
+    x: Float64s
+    y: Float64s
+    yaw: Float64s
+    best_per_yaw: Floats
+    decoy_best: float
+
+
 @dataclass(frozen=True, eq=False)
 class Candidate:
     """A pose that the search proposes, best first. score: of the metric; overlap: 0 to 1."""
@@ -167,3 +198,4 @@ class Match:
     timings: Mapping[str, float] = field(default_factory=dict)
     T_level_target: Float64s | None = None
     T_level_source: Float64s | None = None
+    picture: SearchPicture | None = None
