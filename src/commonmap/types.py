@@ -31,6 +31,7 @@ class Cloud:
     intensity: (N,) float32, in the file's own unit, where the file has it.
     time: (N,) float64, seconds, where the file has it.
     origin: (N, 3) float32, where the sensor was when it saw the point (ray starts), where known.
+    seen_by: (N,) uint8, in a common map: 1 the target's robot saw it, 2 the source's, 3 both.
     """
 
     xyz: Float64s
@@ -39,6 +40,7 @@ class Cloud:
     intensity: Float32s | None = None
     time: Float64s | None = None
     origin: Float32s | None = None
+    seen_by: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +144,11 @@ class SearchPicture:
 
     score: (nx, ny), higher is better, over the translations at the best yaw; NaN where the
         overlap is too small to count.
-    x: (nx,), y: (ny,) metres, the translation of each cell, target frame.
+    x: (nx,), y: (ny,) metres, where the point `centre` of the source comes to lie in the target
+        frame, rising.
+    centre: (3,) metres, a point of the source frame near the middle of the source map. (The
+        translation of a motion turns about a frame origin that may be kilometres away; the
+        place of the map's centre is what a reader of the picture can compare between yaws.)
     yaw: (m,) radians, rising. best_per_yaw: (m,) the best score of each yaw.
     decoy_best: the best score of the mirrored source over all poses.
     """
@@ -150,6 +156,7 @@ class SearchPicture:
     score: Floats
     x: Float64s
     y: Float64s
+    centre: Float64s
     yaw: Float64s
     best_per_yaw: Floats
     decoy_best: float
