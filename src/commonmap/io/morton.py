@@ -1,0 +1,184 @@
+"""Leaves of an octree in Morton order: codes, sorting, pruning, counting nodes.
+
+The Morton code of a voxel interleaves the 16 bits of its three keys, x lowest, so that bits
+`3 b`, `3 b + 1`, `3 b + 2` are bit `b` of x, y, z and three bits together are the child index of
+OctoMap. Leaves sorted by code stand in the order in which OctoMap's files hold them, and a leaf of
+depth `d` covers the codes `code` to `code + 8**(16 - d)`, the end not included.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from commonmap.errors import InputError
+from commonmap.types import TREE_DEPTH, Leaves
+
+Codes = NDArray[np.int64]
+
+
+@numba.njit(cache=True, inline="always")  # type: ignore[misc]
+def spread(k):  # type: ignore[no-untyped-def]
+    """Return the 16 bits of `k` at every third bit."""
+    v = np.int64(k) & 0xFFFF
+    v = (v | (v << 16)) & 0x0000FF0000FF
+    v = (v | (v << 8)) & 0x00F00F00F00F
+    v = (v | (v << 4)) & 0x0C30C30C30C3
+    v = (v | (v << 2)) & 0x249249249249
+    return v
+
+
+@numba.njit(cache=True, inline="always")  # type: ignore[misc]
+def gather(code):  # type: ignore[no-untyped-def]
+    """Return every third bit of `code`: the inverse of `spread`."""
+    v = np.int64(code) & 0x249249249249
+    v = (v | (v >> 2)) & 0x0C30C30C30C3
+    v = (v | (v >> 4)) & 0x00F00F00F00F
+    v = (v | (v >> 8)) & 0x0000FF0000FF
+    v = (v | (v >> 16)) & 0xFFFF
+    return v
+
+
+@numba.njit(cache=True)  # type: ignore[misc]
+def _encode(keys):  # type: ignore[no-untyped-def]
+    codes = np.empty(keys.shape[0], np.int64)
+    for n in range(keys.shape[0]):
+        codes[n] = spread(keys[n, 0]) | spread(keys[n, 1]) << 1 | spread(keys[n, 2]) << 2
+    return codes
+
+
+@numba.njit(cache=True)  # type: ignore[misc]
+def _decode(codes):  # type: ignore[no-untyped-def]
+    keys = np.empty((codes.shape[0], 3), np.uint16)
+    for n in range(codes.shape[0]):
+        keys[n, 0] = gather(codes[n])
+        keys[n, 1] = gather(codes[n] >> 1)
+        keys[n, 2] = gather(codes[n] >> 2)
+    return keys
+
+
+def encode(keys: NDArray[np.uint16]) -> Codes:
+    """Return the Morton codes (N,) int64 of keys (N, 3) uint16."""
+    codes: Codes = _encode(np.ascontiguousarray(keys, dtype=np.uint16))
+    return codes
+
+
+def decode(codes: Codes) -> NDArray[np.uint16]:
+    """Return the keys (N, 3) uint16 of Morton codes (N,)."""
+    keys: NDArray[np.uint16] = _decode(np.ascontiguousarray(codes, dtype=np.int64))
+    return keys
+
+
+@numba.njit(cache=True)  # type: ignore[misc]
+def _check(codes, depth):  # type: ignore[no-untyped-def]
+    """0: sorted and apart; 1: not sorted; 2: a leaf off its own grid; 3: deeper than the tree."""
+    for n in range(codes.shape[0]):
+        if depth[n] > TREE_DEPTH:
+            return 3
+        if codes[n] & ((np.int64(1) << (3 * (TREE_DEPTH - depth[n]))) - 1):
+            return 2
+    for n in range(1, codes.shape[0]):
+        if codes[n] < codes[n - 1] + (np.int64(1) << (3 * (TREE_DEPTH - depth[n - 1]))):
+            return 1
+    return 0
+
+
+def sort(leaves: Leaves) -> tuple[Leaves, Codes]:
+    """Return the leaves in Morton order and their codes, or raise where leaves overlap."""
+    codes = encode(leaves.keys)
+    state = _check(codes, leaves.depth)
+    if state == 1:
+        order = np.argsort(codes, kind="stable")
+        codes = codes[order]
+        leaves = Leaves(
+            leaves.resolution, leaves.keys[order], leaves.depth[order], leaves.log_odds[order]
+        )
+        state = _check(codes, leaves.depth)
+        if state == 1:
+            raise InputError("leaves of an octree must not overlap; two of them share a voxel")
+    if state == 2:
+        raise InputError(
+            "the key of a leaf must be its lower corner, a multiple of 2**(16 - depth); one is not"
+        )
+    if state == 3:
+        raise InputError(f"an octree is {TREE_DEPTH} levels deep; a leaf says it lies deeper")
+    return leaves, codes
+
+
+@numba.njit(cache=True)  # type: ignore[misc]
+def _prune(codes, depth, value, label):  # type: ignore[no-untyped-def]
+    """Join eight equal sibling leaves into their parent, in place; return how many are left."""
+    top = 0
+    for n in range(codes.shape[0]):
+        code, d, v, w = codes[n], depth[n], value[n], label[n]
+        codes[top], depth[top], value[top], label[top] = code, d, v, w
+        top += 1
+        while d > 0 and top >= 8:
+            size = np.int64(1) << (3 * (TREE_DEPTH - d))
+            first = codes[top - 1] - 7 * size
+            if (codes[top - 1] // size) & 7 != 7 or codes[top - 8] != first:
+                break
+            same = True
+            for m in range(top - 8, top):
+                if depth[m] != d or value[m] != v or label[m] != w:
+                    same = False
+                    break
+            if not same:
+                break
+            top -= 7
+            d -= 1
+            depth[top - 1] = d
+    return top
+
+
+def prune(leaves: Leaves, labels: NDArray[np.int64] | None = None) -> Leaves:
+    """Return the leaves with every eight equal siblings joined, as OctoMap prunes, in Morton order.
+
+    labels: (N,) a further value that must be equal too (who saw the leaf, for example).
+    """
+    return prune_labelled(
+        leaves, np.zeros(len(leaves.depth), np.int64) if labels is None else labels
+    )[0]
+
+
+def prune_labelled(leaves: Leaves, labels: NDArray[np.int64]) -> tuple[Leaves, NDArray[np.int64]]:
+    """Return pruned leaves and the label of each; siblings are joined where labels agree too.
+
+    leaves: in Morton order where labels matter (they are taken in the order given).
+    """
+    ordered, codes = sort(leaves)
+    if ordered is not leaves:
+        labels = labels[np.argsort(encode(leaves.keys), kind="stable")]
+    depth, value = ordered.depth.copy(), ordered.log_odds.copy()
+    label = labels.astype(np.int64)
+    n = int(_prune(codes, depth, value, label))
+    pruned = Leaves(leaves.resolution, decode(codes[:n]), depth[:n].copy(), value[:n].copy())
+    return pruned, label[:n].copy()
+
+
+@numba.njit(cache=True, inline="always")  # type: ignore[misc]
+def shared_depth(a, b):  # type: ignore[no-untyped-def]
+    """Return the depth of the deepest node that holds both voxels; `a` and `b` differ."""
+    x = a ^ b
+    d = TREE_DEPTH
+    while x:
+        x >>= 3
+        d -= 1
+    return d
+
+
+@numba.njit(cache=True)  # type: ignore[misc]
+def count_inner(codes, depth):  # type: ignore[no-untyped-def]
+    """Return how many inner nodes stand above sorted leaves, the root among them."""
+    inner = 0
+    for n in range(codes.shape[0]):
+        above = -1 if n == 0 else shared_depth(codes[n - 1], codes[n])
+        inner += depth[n] - 1 - above
+    return inner
+
+
+def count_nodes(leaves: Leaves) -> int:
+    """Return the number of nodes, inner and leaf, of the octree: OctoMap's `size()`."""
+    ordered, codes = sort(leaves)
+    return int(count_inner(codes, ordered.depth)) + len(codes)
