@@ -1,0 +1,297 @@
+"""The ground under a cloud: robust to canopies, roofs, slopes to 30 degrees and low blunders.
+
+The ground is the lowest surface that no reachable lower point contradicts. On a grid of lowest
+points its largest `s`-Lipschitz minorant (the lower envelope of cones of slope `s`, Vosselman 2000)
+removes whatever rises more steeply than any ground does: trees, cars, walls, the rim of roofs. What
+is left in the middle of large flat roofs is a component that stands above everything round it, and
+goes as a whole. The rest is filled in by push and pull over a pyramid of means.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from scipy import ndimage
+
+from commonmap.errors import EmptyMapError
+from commonmap.types import Bools, Float64s
+
+MAX_SLOPE = math.tan(math.radians(38.0))
+"""Steepest ground that is believed: 30 degrees, and what roughness adds over one cell."""
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """A ground surface on a grid (cell [i, j] as in `GridMap`), defined everywhere on it.
+
+    origin: (2,) metres. cell: metres. z: (nx, ny) float64 height at the cells' centres.
+    seen: (nx, ny) bool, the ground itself was measured in this cell; else z is interpolated.
+    """
+
+    origin: Float64s
+    cell: float
+    z: Float64s
+    seen: Bools
+
+    def height_at(self, xy: Float64s) -> Float64s:
+        """Return the ground's z at (N, 2) positions, bilinear, constant beyond the outer centres."""
+        return _bilinear(self.z, self.origin, self.cell, np.ascontiguousarray(xy, dtype=np.float64))
+
+
+def find_ground(xyz: Float64s, *, cell: float | None = None) -> Ground:
+    """Return the ground under an (N, 3) cloud that is level (z up), in metres.
+
+    cell: edge of the grid; by default half a metre, or more where the points are sparse.
+    Raises EmptyMapError for a cloud with fewer than three points.
+    """
+    if len(xyz) < 3:
+        raise EmptyMapError(f"a map needs at least three points to have a ground; {len(xyz)} came")
+    if cell is None:
+        cell = max(0.5, 1.5 * typical_spacing(xyz))
+    origin = np.floor(xyz[:, :2].min(axis=0) / cell) * cell
+    shape = tuple(np.floor((xyz[:, :2].max(axis=0) - origin) / cell).astype(int) + 1)
+    lowest = _lowest(np.ascontiguousarray(xyz, dtype=np.float64), origin, cell, *shape)
+    lowest = _drop_low_blunders(lowest, cell)
+    tolerance = 0.15 + 0.1 * cell
+
+    # What no cone of the steepest believable slope undercuts may be ground
+    envelope = _cone_envelope(lowest, MAX_SLOPE * cell)
+    candidate = np.isfinite(lowest) & (lowest - envelope <= tolerance)
+
+    # A smooth piece that stands above all that surrounds it is a roof or a deck
+    candidate = _drop_standing_pieces(lowest, candidate, MAX_SLOPE * cell + tolerance)
+
+    # What still rises from the smoothed surface is low growth, a kerb stone, the foot of a stem
+    z = fill(np.where(candidate, lowest, np.nan))
+    for _ in range(2):
+        smooth = ndimage.gaussian_filter(z, max(1.0, 1.0 / cell), mode="nearest")
+        candidate &= lowest - smooth <= 2.0 * tolerance
+        z = fill(np.where(candidate, lowest, np.nan))
+    return Ground(origin=origin, cell=cell, z=z, seen=candidate)
+
+
+def typical_spacing(xyz: Float64s) -> float:
+    """Return the distance between neighbouring columns of points seen from above, in metres.
+
+    The share of occupied cells of a 1 m grid is known; within them n points on an area A lie
+    about sqrt(A / n) apart. Robust against unequal density: the median over cells.
+    """
+    extent = np.ptp(xyz[:, :2], axis=0)
+    coarse = max(1.0, float(extent.max()) / 4096.0)
+    for _ in range(4):
+        index = np.floor((xyz[:, :2] - xyz[:, :2].min(axis=0)) / coarse).astype(np.int64)
+        _, counts = np.unique(index[:, 0] * (index[:, 1].max() + 1) + index[:, 1], return_counts=True)
+        median = float(np.median(counts))
+        if median >= 4 or len(counts) < 16:
+            break
+        coarse *= 2.0
+    return float(coarse / math.sqrt(max(median, 1.0)))
+
+
+def fill(z: Float64s) -> Float64s:
+    """Return z with NaN cells filled: a plane through what is known, plus push-pull of the rest.
+
+    The plane makes gaps and rims follow a slope; push-pull (means over a pyramid, Gortler et al.
+    1996) makes them follow the relief. Where nothing is known at all the answer is zero.
+    """
+    known = np.isfinite(z)
+    if not known.any():
+        return np.zeros_like(z)
+    trend = _fit_plane(z, known)
+    values, weights = [np.where(known, z - trend, 0.0)], [known.astype(np.float64)]
+    while max(values[-1].shape) > 1:
+        value, weight = _halve(values[-1] * weights[-1]), _halve(weights[-1])
+        values.append(np.divide(value, weight, out=np.zeros_like(value), where=weight > 0))
+        weights.append(np.minimum(weight, 1.0))
+    filled = values[-1]
+    for value, weight in zip(values[-2::-1], weights[-2::-1], strict=True):
+        coarse = _double(filled, value.shape)
+        filled = weight * value + (1.0 - weight) * coarse
+    return np.where(known, z, filled + trend)
+
+
+def _fit_plane(z: Float64s, known: Bools) -> Float64s:
+    """Return the least-squares plane through the known cells, three times reweighted (Cauchy)."""
+    i, j = np.nonzero(known)
+    A = np.column_stack([i - i.mean(), j - j.mean(), np.ones(len(i))]).astype(np.float64)
+    b, w = z[known], np.ones(len(i))
+    x = np.zeros(3)
+    for _ in range(4):
+        N = (A * w[:, None]).T @ A + 1e-9 * len(i) * np.eye(3)
+        x = np.linalg.solve(N, (A * w[:, None]).T @ b)
+        residual = b - A @ x
+        scale = 1.4826 * float(np.median(np.abs(residual))) + 1e-3
+        w = 1.0 / (1.0 + (residual / (2.0 * scale)) ** 2)
+    I, J = np.meshgrid(*(np.arange(n, dtype=np.float64) for n in z.shape), indexing="ij")
+    return np.asarray((I - i.mean()) * x[0] + (J - j.mean()) * x[1] + x[2])
+
+
+def _halve(a: Float64s) -> Float64s:
+    padded = np.pad(a, [(0, n % 2) for n in a.shape])
+    return np.asarray(padded[::2, ::2] + padded[1::2, ::2] + padded[::2, 1::2] + padded[1::2, 1::2])
+
+
+def _double(a: Float64s, shape: tuple[int, ...]) -> Float64s:
+    """Return `a` bilinearly interpolated to twice its size, cut to `shape`."""
+    for axis, n in enumerate(shape):
+        left = np.concatenate([a.take([0], axis), a.take(range(a.shape[axis] - 1), axis)], axis)
+        right = np.concatenate([a.take(range(1, a.shape[axis]), axis), a.take([-1], axis)], axis)
+        pair = np.stack([0.75 * a + 0.25 * left, 0.75 * a + 0.25 * right], axis=axis + 1)
+        doubled = list(a.shape)
+        doubled[axis] *= 2
+        a = pair.reshape(doubled).take(range(n), axis)
+    return a
+
+
+@numba.njit(cache=True)  # type: ignore[misc]
+def _lowest(xyz, origin, cell, nx, ny):  # type: ignore[no-untyped-def]
+    z = np.full((nx, ny), np.nan)
+    for n in range(xyz.shape[0]):
+        i = int(np.floor((xyz[n, 0] - origin[0]) / cell))
+        j = int(np.floor((xyz[n, 1] - origin[1]) / cell))
+        if not z[i, j] <= xyz[n, 2]:
+            z[i, j] = xyz[n, 2]
+    return z
+
+
+def _drop_low_blunders(lowest: Float64s, cell: float) -> Float64s:
+    """Return `lowest` without cells far below the fourth lowest of their 7x7 neighbours."""
+    high = np.where(np.isfinite(lowest), lowest, np.inf)
+    fourth = ndimage.rank_filter(high, rank=4, size=7, mode="constant", cval=np.inf)
+    reach = 3.0 * math.sqrt(2.0) * cell * MAX_SLOPE + 0.5
+    blunder = np.isfinite(fourth) & (high < fourth - reach)
+    return np.where(blunder, np.nan, lowest)
+
+
+@numba.njit(cache=True)  # type: ignore[misc]
+def _cone_envelope(lowest, rise):  # type: ignore[no-untyped-def]
+    """Return min over cells q of lowest[q] + rise * distance(p, q), by a two-pass chamfer."""
+    nx, ny = lowest.shape
+    E = np.empty((nx, ny))
+    for i in range(nx):
+        for j in range(ny):
+            E[i, j] = lowest[i, j] if np.isfinite(lowest[i, j]) else np.inf
+    near, far = rise, rise * np.sqrt(2.0)
+    for _ in range(2):
+        for i in range(nx):
+            for j in range(ny):
+                e = E[i, j]
+                if i > 0:
+                    e = min(e, E[i - 1, j] + near)
+                    if j > 0:
+                        e = min(e, E[i - 1, j - 1] + far)
+                    if j < ny - 1:
+                        e = min(e, E[i - 1, j + 1] + far)
+                if j > 0:
+                    e = min(e, E[i, j - 1] + near)
+                E[i, j] = e
+        for i in range(nx - 1, -1, -1):
+            for j in range(ny - 1, -1, -1):
+                e = E[i, j]
+                if i < nx - 1:
+                    e = min(e, E[i + 1, j] + near)
+                    if j > 0:
+                        e = min(e, E[i + 1, j - 1] + far)
+                    if j < ny - 1:
+                        e = min(e, E[i + 1, j + 1] + far)
+                if j < ny - 1:
+                    e = min(e, E[i, j + 1] + near)
+                E[i, j] = e
+    return E
+
+
+def _drop_standing_pieces(z: Float64s, candidate: Bools, step: float) -> Bools:
+    """Return `candidate` without the smooth pieces that stand above what surrounds them.
+
+    Pieces are cells joined by steps of at most `step`. For each piece the nearest cells of other
+    pieces, up to a few cells away, are its surroundings; it stands when most of them are lower by
+    more than a metre. The largest piece stays.
+    """
+    label = _label_smooth(np.where(candidate, z, np.nan), step)
+    n_pieces = int(label.max())
+    if n_pieces < 2:
+        return candidate
+    area = np.bincount(label.ravel(), minlength=n_pieces + 1)
+    area[0] = 0
+    lower, higher = _compare_borders(np.where(candidate, z, np.nan), label, n_pieces, 6, 1.0)
+    stands = (lower > 2.0 * higher) & (lower > 0)
+    stands[int(np.argmax(area))] = False
+    stands[0] = False
+    kept = candidate & ~stands[label]
+    return kept if kept.any() else candidate
+
+
+@numba.njit(cache=True)  # type: ignore[misc]
+def _label_smooth(z, step):  # type: ignore[no-untyped-def]
+    nx, ny = z.shape
+    label = np.zeros((nx, ny), np.int32)
+    stack = np.empty((nx * ny, 2), np.int32)
+    n = 0
+    for i0 in range(nx):
+        for j0 in range(ny):
+            if label[i0, j0] != 0 or not np.isfinite(z[i0, j0]):
+                continue
+            n += 1
+            label[i0, j0] = n
+            stack[0, 0], stack[0, 1] = i0, j0
+            top = 1
+            while top > 0:
+                top -= 1
+                i, j = stack[top, 0], stack[top, 1]
+                for di in range(-1, 2):
+                    for dj in range(-1, 2):
+                        a, b = i + di, j + dj
+                        if a < 0 or b < 0 or a >= nx or b >= ny or label[a, b] != 0:
+                            continue
+                        if abs(z[a, b] - z[i, j]) <= step:
+                            label[a, b] = n
+                            stack[top, 0], stack[top, 1] = a, b
+                            top += 1
+    return label
+
+
+@numba.njit(cache=True)  # type: ignore[misc]
+def _compare_borders(z, label, n_pieces, reach, margin):  # type: ignore[no-untyped-def]
+    """Count, per piece, looks along x and y that meet another piece clearly lower, or not lower."""
+    lower = np.zeros(n_pieces + 1, np.int64)
+    higher = np.zeros(n_pieces + 1, np.int64)
+    nx, ny = z.shape
+    for i in range(nx):
+        for j in range(ny):
+            me = label[i, j]
+            if me == 0:
+                continue
+            for d in range(4):
+                di = 1 if d == 0 else (-1 if d == 1 else 0)
+                dj = 1 if d == 2 else (-1 if d == 3 else 0)
+                for k in range(1, reach + 1):
+                    a, b = i + k * di, j + k * dj
+                    if a < 0 or b < 0 or a >= nx or b >= ny:
+                        break
+                    other = label[a, b]
+                    if other == me:
+                        break
+                    if other != 0:
+                        if z[a, b] < z[i, j] - margin:
+                            lower[me] += 1
+                        else:
+                            higher[me] += 1
+                        break
+    return lower, higher
+
+
+@numba.njit(cache=True)  # type: ignore[misc]
+def _bilinear(z, origin, cell, xy):  # type: ignore[no-untyped-def]
+    nx, ny = z.shape
+    out = np.empty(xy.shape[0])
+    for n in range(xy.shape[0]):
+        u = min(max((xy[n, 0] - origin[0]) / cell - 0.5, 0.0), nx - 1.0)
+        v = min(max((xy[n, 1] - origin[1]) / cell - 0.5, 0.0), ny - 1.0)
+        i, j = min(int(u), max(nx - 2, 0)), min(int(v), max(ny - 2, 0))
+        a, b = min(i + 1, nx - 1), min(j + 1, ny - 1)
+        s, t = u - i, v - j
+        out[n] = (1 - s) * ((1 - t) * z[i, j] + t * z[i, b]) + s * ((1 - t) * z[a, j] + t * z[a, b])
+    return out

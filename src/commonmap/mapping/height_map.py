@@ -1,0 +1,146 @@
+"""Height maps and height slabs: what a map says per cell of the ground plan, above its own ground.
+
+Layers of the `GridMap` that `build_height_map` returns (nx, ny unless said):
+
+    known          bool, the column was observed below `max_height`
+    ground         float, z of the ground, metres; NaN where nothing was observed near
+    height         float, height above ground of the highest point below `max_height`; NaN unknown
+    lowest, highest  float, z of the lowest and highest point of the column; NaN unknown
+    count          int32, points in the column
+    slab_occupied  bool (n_slabs, nx, ny), a point lies in the slab
+    slab_known     bool (n_slabs, nx, ny), the slab was observed: occupied, or seen through
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from commonmap.errors import EmptyMapError, InputError
+from commonmap.mapping.ground import Ground, find_ground, typical_spacing
+from commonmap.types import Float64s, GridMap
+
+NICE_CELLS = (0.05, 0.1, 0.2, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+"""Cell sizes to choose from, metres."""
+
+
+def choose_cell(target_xyz: Float64s, source_xyz: Float64s) -> float:
+    """Return the cell size in metres for matching two clouds, from their density and extent.
+
+    A cell should be hit by about ten points in the sparser map, and no finer than the shape of
+    the source can be trusted over its extent (an odometry drifts about 1 % of the way).
+    """
+    spacing = max(typical_spacing(target_xyz), typical_spacing(source_xyz))
+    extent = min(robust_extent(target_xyz), robust_extent(source_xyz))
+    wish = max(3.0 * spacing, extent / 120.0)
+    fitting = [c for c in NICE_CELLS if c >= wish * 0.999]
+    return max(0.2, fitting[0]) if fitting else float(np.ceil(wish))
+
+
+def robust_extent(xyz: Float64s) -> float:
+    """Return the wider side in metres of the box that holds the middle 98 % of the points."""
+    low, high = np.quantile(xyz[:, :2], [0.01, 0.99], axis=0)
+    return float((high - low).max())
+
+
+def choose_slabs(heights: Float64s, *, cell: float, max_height: float | None = None) -> Float64s:
+    """Return the edges (K+1,) in metres of the height slabs above ground.
+
+    Under a `max_height` of up to 2 m the slabs are even, five to a map; else they double in
+    thickness from 0.25 m to the height that one point in a hundred exceeds, as both the detail of
+    things and the accuracy of their height do.
+    """
+    lowest = 0.25 if max_height is None or max_height > 1.0 else 0.2 * max_height
+    if max_height is not None and max_height <= 2.0:
+        return np.linspace(lowest, max_height, 5)
+    above = heights[heights > lowest]
+    top = float(np.quantile(above, 0.99)) if len(above) else 1.0
+    if max_height is not None:
+        top = min(top, max_height)
+    edges = [lowest]
+    while edges[-1] < top and len(edges) < 12:
+        edges.append(2.0 * edges[-1])
+    if len(edges) < 3:
+        edges = [lowest, 2 * lowest, 4 * lowest]
+    if max_height is not None:
+        edges = [e for e in edges if e < 0.75 * max_height] + [max_height]
+    return np.array(edges)
+
+
+def build_height_map(
+    xyz: Float64s,
+    *,
+    cell: float,
+    slab_edges: Float64s,
+    ground: Ground | None = None,
+    max_height: float | None = None,
+) -> GridMap:
+    """Return the height map of an (N, 3) cloud that is level, with layers named above.
+
+    cell: metres. slab_edges: (K+1,) rising heights above ground, at most 32 slabs.
+    ground: by default found from the cloud. max_height: use only what is less than this above
+    ground (1 m is the paper's set-up). Points more than 1 m under the ground are left out.
+    Raises EmptyMapError when nothing is left.
+    """
+    if not (np.isfinite(cell) and cell > 0):
+        raise InputError(f"the cell of a height map must be a positive length in metres; {cell} came")
+    if len(slab_edges) < 2 or len(slab_edges) > 33 or not np.all(np.diff(slab_edges) > 0):
+        raise InputError("slab_edges must be 2 to 33 rising heights in metres")
+    ground = ground or find_ground(xyz)
+    height = xyz[:, 2] - ground.height_at(xyz[:, :2])
+    limit = np.inf if max_height is None else max_height
+    used = (height > -1.0) & (height < limit)
+    if not used.any():
+        raise EmptyMapError(
+            f"no point lies between 1 m below the ground and {limit:g} m above it; nothing to match"
+        )
+    points, height = np.ascontiguousarray(xyz[used]), height[used]
+    origin = np.floor(points[:, :2].min(axis=0) / cell) * cell
+    n_x, n_y = np.floor((points[:, :2].max(axis=0) - origin) / cell).astype(int) + 1
+    count, top, lowest, highest, bits = _fill_columns(
+        points, height, origin, cell, int(n_x), int(n_y), np.asarray(slab_edges, np.float64)
+    )
+    known = count > 0
+    slabs = np.arange(len(slab_edges) - 1, dtype=np.uint32)[:, None, None]
+    occupied = ((bits >> slabs) & 1).astype(bool)
+    i, j = np.meshgrid(np.arange(n_x), np.arange(n_y), indexing="ij")
+    centres = origin + (np.column_stack([i.ravel(), j.ravel()]) + 0.5) * cell
+    layers: dict[str, NDArray[Any]] = {
+        "known": known,
+        "ground": np.where(known, ground.height_at(centres).reshape(n_x, n_y), np.nan),
+        "height": np.where(known, np.maximum(top, 0.0), np.nan),
+        "lowest": lowest,
+        "highest": highest,
+        "count": count,
+        "slab_occupied": occupied,
+        "slab_known": np.broadcast_to(known, occupied.shape),
+    }
+    return GridMap(origin=origin, cell=cell, layers=layers, slab_edges=np.asarray(slab_edges))
+
+
+@numba.njit(cache=True)  # type: ignore[misc]
+def _fill_columns(xyz, height, origin, cell, n_x, n_y, edges):  # type: ignore[no-untyped-def]
+    count = np.zeros((n_x, n_y), np.int32)
+    top = np.full((n_x, n_y), np.nan)
+    lowest = np.full((n_x, n_y), np.nan)
+    highest = np.full((n_x, n_y), np.nan)
+    bits = np.zeros((n_x, n_y), np.uint32)
+    for n in range(xyz.shape[0]):
+        i = min(int((xyz[n, 0] - origin[0]) / cell), n_x - 1)
+        j = min(int((xyz[n, 1] - origin[1]) / cell), n_y - 1)
+        count[i, j] += 1
+        if not top[i, j] >= height[n]:
+            top[i, j] = height[n]
+        if not lowest[i, j] <= xyz[n, 2]:
+            lowest[i, j] = xyz[n, 2]
+        if not highest[i, j] >= xyz[n, 2]:
+            highest[i, j] = xyz[n, 2]
+        if height[n] >= edges[0] and height[n] < edges[-1]:
+            k = 0
+            while height[n] >= edges[k + 1]:
+                k += 1
+            bits[i, j] |= np.uint32(1) << np.uint32(k)
+    return count, top, lowest, highest, bits

@@ -1,0 +1,217 @@
+"""From the grid's pose to the points' pose: z in closed form, then 6-DoF registration.
+
+small_gicp (generalised ICP, Segal et al. 2009) walks from the search's peak with correspondences of
+falling reach; a robust point-to-plane solve on fixed correspondences ends it and gives what the
+answer needs to be honest: residuals area by area. The covariance is the sandwich
+`H^-1 (sum over areas g_a g_a^T) H^-1` (Liang and Zeger 1986): neighbouring points err together, so
+the areas count as observations and not the points.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from commonmap.frames import apply, from_rotation
+from commonmap.mapping.ground import Ground
+from commonmap.types import Float64s
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """The refined pose and how well it holds.
+
+    T_target_source: (4, 4). centre: (3,) about which the covariance's rotation turns, target frame.
+    covariance: (6, 6) of [x, y, z, rotation about x, y, z], metres and radians.
+    inlier_share: of the source's points within reach of the target's columns, how many lie within
+        one cell of a target point. rms: metres, robust, of the point-to-plane residuals.
+    moved: (metres at the centre, radians) between the search's pose and this one.
+    converged: False where the registration left the basin of the search's peak; then
+        `T_target_source` is the pose that went in.
+    """
+
+    T_target_source: Float64s
+    centre: Float64s
+    covariance: Float64s
+    inlier_share: float
+    rms: float
+    moved: tuple[float, float]
+    converged: bool
+
+
+def lift(
+    T_planar: Float64s, ground_target: Ground, ground_source: Ground, *, n_most: int = 20_000
+) -> Float64s:
+    """Return the planar motion with z in closed form: the median step between the two grounds.
+
+    Cells whose ground both maps measured count; where there are fewer than 10, all cells that
+    overlap count.
+    """
+    i, j = np.nonzero(ground_source.seen)
+    if len(i) == 0:
+        i, j = np.nonzero(np.ones_like(ground_source.seen))
+    step = max(1, len(i) // n_most)
+    i, j = i[::step], j[::step]
+    xy = ground_source.origin + (np.column_stack([i, j]) + 0.5) * ground_source.cell
+    z = ground_source.z[i, j]
+    moved = apply(T_planar, np.column_stack([xy, z]))
+    cell = np.floor((moved[:, :2] - ground_target.origin) / ground_target.cell).astype(np.int64)
+    inside = np.all((cell >= 0) & (cell < ground_target.z.shape), axis=1)
+    if not inside.any():
+        return T_planar
+    seen = np.zeros(len(cell), dtype=bool)
+    seen[inside] = ground_target.seen[cell[inside, 0], cell[inside, 1]]
+    used = seen if np.count_nonzero(seen) >= 10 else inside
+    difference = ground_target.height_at(moved[used, :2]) - moved[used, 2]
+    lifted = T_planar.copy()
+    lifted[2, 3] += float(np.median(difference))
+    return lifted
+
+
+def refine(
+    target_xyz: Float64s,
+    source_xyz: Float64s,
+    T_target_source: Float64s,
+    *,
+    cell: float,
+    threads: int = 2,
+    n_most: int = 60_000,
+) -> Refined:
+    """Return the pose refined on the points, starting from within about one `cell` of the truth.
+
+    target_xyz: (N, 3), source_xyz: (M, 3) metres. cell: metres, of the search. Points are thinned
+    to one per voxel of a third of the cell, or coarser to stay near `n_most`.
+    """
+    import small_gicp
+
+    start = np.asarray(T_target_source, dtype=np.float64)
+    moved_source = apply(start, source_xyz)
+    low, high = moved_source.min(axis=0) - 2.0 * cell, moved_source.max(axis=0) + 2.0 * cell
+    inside = np.all((target_xyz >= low) & (target_xyz <= high), axis=1)
+    if np.count_nonzero(inside) < 20 or len(source_xyz) < 20:
+        return _unrefined(start, source_xyz)
+
+    # Work about the middle of the overlap: small numbers, and rotations that mean something
+    centre = 0.5 * (low + high)
+    voxel = max(cell / 3.0, 0.03)
+    target = _thin(target_xyz[inside] - centre, voxel, 2 * n_most)
+    source = _thin(moved_source - centre, voxel, n_most)
+    distance_floor = max(cell / 3.0, 0.05)
+    cloud, tree = small_gicp.preprocess_points(
+        target, downsampling_resolution=voxel / 4.0, num_neighbors=12, num_threads=threads
+    )
+    draft, _ = small_gicp.preprocess_points(
+        source, downsampling_resolution=voxel / 4.0, num_neighbors=12, num_threads=threads
+    )
+    T = np.eye(4)
+    for reach in (3.0 * cell, 1.5 * cell, max(0.75 * cell, distance_floor)):
+        result = small_gicp.align(
+            cloud, draft, tree, init_T_target_source=T, registration_type="GICP",
+            max_correspondence_distance=reach, num_threads=threads, max_iterations=30,
+        )  # fmt: skip
+        if np.isfinite(result.T_target_source).all() and result.num_inliers >= 20:
+            T = np.asarray(result.T_target_source)
+    normals = np.asarray(cloud.normals())[:, :3]
+    points = np.asarray(cloud.points())[:, :3]
+    T, covariance, rms = _solve_point_to_plane(
+        points, normals, np.asarray(draft.points())[:, :3], T, reach=cell, floor=0.01
+    )
+
+    shift = float(np.linalg.norm(T[:3, 3]))
+    turn = float(Rotation.from_matrix(T[:3, :3]).magnitude())
+    radius = 0.5 * float(np.linalg.norm((high - low)[:2]))
+    stayed = shift <= 3.0 * cell and turn <= max(math.radians(3.0), 4.0 * cell / radius)
+    if not stayed:
+        T = np.eye(4)
+    share = _inlier_share(points, apply(T, source), cell)
+    to_centre = from_rotation(np.eye(3), centre)
+    from_centre = from_rotation(np.eye(3), -centre)
+    return Refined(
+        to_centre @ T @ from_centre @ start,
+        centre,
+        covariance,
+        share,
+        rms,
+        (shift, turn),
+        stayed,
+    )
+
+
+def _unrefined(start: Float64s, source_xyz: Float64s) -> Refined:
+    centre = apply(start, source_xyz).mean(axis=0) if len(source_xyz) else start[:3, 3]
+    return Refined(start, centre, np.eye(6), 0.0, float("inf"), (0.0, 0.0), False)
+
+
+def _thin(xyz: Float64s, voxel: float, n_most: int) -> Float64s:
+    """Return the mean point of every voxel, the voxel widened until about `n_most` are left."""
+    for _ in range(8):
+        key = np.floor(xyz / voxel).astype(np.int64)
+        key -= key.min(axis=0)
+        span = key.max(axis=0) + 1
+        flat = (key[:, 0] * span[1] + key[:, 1]) * span[2] + key[:, 2]
+        _, inverse, counts = np.unique(flat, return_inverse=True, return_counts=True)
+        if len(counts) <= n_most:
+            break
+        voxel *= max(1.15, math.sqrt(len(counts) / n_most) * 0.95)
+    mean = np.column_stack([np.bincount(inverse, weights=xyz[:, a]) for a in range(3)])
+    return np.asarray(mean / counts[:, None])
+
+
+def _solve_point_to_plane(
+    target: Float64s, normals: Float64s, source: Float64s, T: Float64s, *, reach: float, floor: float
+) -> tuple[Float64s, Float64s, float]:
+    """Return (T, covariance, rms) of robust Gauss-Newton steps on point-to-plane residuals.
+
+    Residual `r = n . (T p - q)`, Cauchy weights scaled by its median absolute deviation. The
+    covariance clusters the residuals by areas of the plan, about 8 x 8 of them.
+    """
+    tree = cKDTree(target, balanced_tree=False)
+    T = T.copy()
+    H, g_areas, scale = np.eye(6), np.zeros((1, 6)), float("inf")
+    for _ in range(8):
+        moved = apply(T, source)
+        distance, index = tree.query(moved, distance_upper_bound=reach, workers=1)
+        hit = np.isfinite(distance)
+        if np.count_nonzero(hit) < 20:
+            return T, np.eye(6), float("inf")
+        p, n = moved[hit], normals[index[hit]]
+        r = np.einsum("ij,ij->i", n, p - target[index[hit]])
+        scale = max(1.4826 * float(np.median(np.abs(r))), floor)
+        w = 1.0 / (1.0 + (r / (2.0 * scale)) ** 2)
+        J = np.hstack([n, np.cross(p, n)])
+        H = (J * w[:, None]).T @ J + 1e-6 * np.eye(6) * len(p)
+        g_points = J * (w * r)[:, None]
+        step = -np.linalg.solve(H, g_points.sum(axis=0))
+        g_areas = _sum_by_area(p, g_points)
+        T = from_rotation(Rotation.from_rotvec(step[3:]).as_matrix(), step[:3]) @ T
+        if np.abs(step[:3]).max() < 1e-4 and np.abs(step[3:]).max() < 1e-5:
+            break
+    inverse = np.linalg.inv(H)
+    n_areas = max(len(g_areas), 2)
+    meat = g_areas.T @ g_areas * n_areas / (n_areas - 1)
+    covariance = inverse @ meat @ inverse
+    # A grid of areas that happens to agree cannot promise more than the residuals allow
+    covariance += scale**2 * inverse + np.diag([1e-3**2] * 3 + [1e-5**2] * 3)
+    return T, 0.5 * (covariance + covariance.T), scale
+
+
+def _sum_by_area(xyz: Float64s, g: Float64s) -> Float64s:
+    low, high = xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0)
+    size = max(float((high - low).max()) / 8.0, 1e-6)
+    ij = np.floor((xyz[:, :2] - low) / size).astype(np.int64)
+    _, inverse = np.unique(ij[:, 0] * 1024 + ij[:, 1], return_inverse=True)
+    return np.column_stack([np.bincount(inverse, weights=g[:, a]) for a in range(6)])
+
+
+def _inlier_share(target: Float64s, source: Float64s, reach: float) -> float:
+    """Return how many source points near a known column of the target are near a target point."""
+    flat, _ = cKDTree(target[:, :2], balanced_tree=False).query(
+        source[:, :2], distance_upper_bound=reach
+    )
+    near, _ = cKDTree(target, balanced_tree=False).query(source, distance_upper_bound=reach)
+    n = int(np.count_nonzero(np.isfinite(flat)))
+    return float(np.count_nonzero(np.isfinite(near)) / n) if n else 0.0

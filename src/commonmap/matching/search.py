@@ -1,0 +1,353 @@
+"""The search over x, y and yaw, full circle, without an initial guess.
+
+At a coarse cell every pose is scored exactly by FFT; the best separate peaks then descend through
+cells half as wide, each climbing to its local maximum. The mirrored source goes the same way in the
+same call: its best score is a draw of what chance alone reaches (the decoy).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+
+import numba
+import numpy as np
+
+from commonmap.frames import from_xyz_yaw
+from commonmap.matching.evidence import (
+    Columns,
+    SlabGrid,
+    Spectra,
+    coarsen,
+    count_tables,
+    evidence_surface,
+    list_columns,
+    scatter,
+    signed_evidence,
+    transform_target,
+    xlogx_table,
+)
+from commonmap.types import Float64s
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Peaks:
+    """Planar poses, best first. pose: (M, 3) x, y, yaw of the source's centre in the target's frame.
+
+    score: (M,) evidence in nats. overlap: (M,) share of the source's known cells that meet known
+    cells of the target. centre: (2,) the point of the source's frame that x, y place.
+    per_yaw: (n_yaw, 2) yaw and the best score at it, of the coarse search.
+    cell: metres, of the grid on which the scores were taken.
+    """
+
+    pose: Float64s
+    score: Float64s
+    overlap: Float64s
+    centre: Float64s
+    per_yaw: Float64s
+    cell: float
+
+    def T_target_source(self, rank: int = 0) -> Float64s:
+        """Return the planar motion of the peak of that rank, (4, 4), z = 0."""
+        x, y, yaw = self.pose[rank]
+        shift = from_xyz_yaw(-self.centre[0], -self.centre[1], 0.0, 0.0)
+        return np.asarray(from_xyz_yaw(x, y, 0.0, yaw) @ shift)
+
+
+@dataclass(frozen=True, eq=False)
+class SearchPlan:
+    """What the search will do, derived from the two maps. cells: coarse to fine, metres."""
+
+    cells: tuple[float, ...]
+    n_yaw: int
+    keep: tuple[int, ...]
+
+
+def plan_search(target: SlabGrid, source: SlabGrid, *, budget: float = 1e8) -> SearchPlan:
+    """Return the pyramid of cells and the number of yaws for two grids of half the finest cell.
+
+    The coarsest cell is the finest one that keeps the exhaustive part within `budget` (padded
+    cells times yaws times layers), and leaves at least 16 cells along the source.
+    """
+    columns = list_columns(source)
+    radius = _radius(columns)
+    cell = 2.0 * target.cell
+    cells = [cell]
+    while True:
+        n_yaw = _n_yaw(radius, cells[0])
+        side = [n * target.cell / cells[0] + 2.0 * radius / cells[0] for n in target.shape]
+        cost = side[0] * side[1] * n_yaw * (4 * target.n_slabs)
+        if cost <= budget or 2.0 * radius / (2.0 * cells[0]) < 16:
+            break
+        cells.insert(0, 2.0 * cells[0])
+    keep = tuple(max(24, 256 >> (2 * level)) for level in range(len(cells)))
+    return SearchPlan(tuple(cells), n_yaw, keep)
+
+
+def search(
+    target: SlabGrid,
+    source: SlabGrid,
+    *,
+    min_overlap: float,
+    mirrored: bool = False,
+    plan: SearchPlan | None = None,
+    n_peaks: int = 16,
+    workers: int = 2,
+    progress: Progress | None = None,
+) -> Peaks:
+    """Return the best separate poses of `source` on `target`, both on cells of half the finest cell.
+
+    min_overlap: share of the source's known cells that must meet known cells of the target.
+    mirrored: reflect the source (x -> -x about its centre) first; no true match exists then.
+    The answer is the same for any number of workers.
+    """
+    plan = plan or plan_search(target, source)
+    finest = 2.0 * target.cell
+    levels = [(cell, *_at_cell(target, source, cell)) for cell in plan.cells]
+    centre = _centre(list_columns(source))
+
+    # Every pose at the coarsest cell
+    cell, coarse_target, columns = levels[0]
+    columns = _centred(columns, centre, mirrored)
+    yaws = 2.0 * np.pi * np.arange(plan.n_yaw) / plan.n_yaw
+    pose, score, per_yaw = _search_all(
+        coarse_target, columns, cell, yaws, min_overlap, workers, progress
+    )
+    order = _separate(pose, score, 2.0 * cell, 3.0 * np.pi / plan.n_yaw, plan.keep[0])
+    pose = pose[order]
+
+    # Each candidate climbs at this cell, then at half of it, and so on
+    step = 2.0 * np.pi / plan.n_yaw
+    overlap = np.zeros(len(pose))
+    for level, (cell, grid, fine_columns) in enumerate(levels):
+        columns = _centred(fine_columns, centre, mirrored)
+        yaw_step = step * cell / plan.cells[0] / 2.0
+        pose, score, overlap = _climb_all(
+            grid, columns, pose, 0.5 * cell, yaw_step, min_overlap, workers
+        )
+        last = level == len(levels) - 1
+        keep = n_peaks if last else plan.keep[level + 1]
+        apart = 2.0 * cell if not last else 4.0 * finest
+        order = _separate(pose, score, apart, (6.0 if last else 2.0) * yaw_step, keep)
+        pose, score, overlap = pose[order], score[order], overlap[order]
+    return Peaks(pose, score, overlap, centre, per_yaw, finest)
+
+
+def _at_cell(target: SlabGrid, source: SlabGrid, cell: float) -> tuple[SlabGrid, Columns]:
+    """Return the target on `cell` and the source's columns on half of it: no holes when turned."""
+    factor = round(cell / target.cell)
+    return coarsen(target, factor), list_columns(coarsen(source, max(1, factor // 2)))
+
+
+def _centre(columns: Columns) -> Float64s:
+    return np.asarray(0.5 * (columns.xy.min(axis=0) + columns.xy.max(axis=0)))
+
+
+def _radius(columns: Columns) -> float:
+    """Return the distance from the centre that 98 % of the source's columns do not exceed."""
+    distance = np.hypot(*(columns.xy - _centre(columns)).T)
+    return float(np.quantile(distance, 0.98))
+
+
+def _n_yaw(radius: float, cell: float) -> int:
+    """Return how many yaws: the outermost columns move by one cell between two of them."""
+    return max(16, int(np.ceil(2.0 * np.pi * radius / cell)))
+
+
+def _centred(columns: Columns, centre: Float64s, mirrored: bool) -> Columns:
+    xy = columns.xy - centre
+    if mirrored:
+        xy = xy * np.array([-1.0, 1.0])
+    return Columns(np.ascontiguousarray(xy), columns.occupied, columns.known, columns.n_slabs)
+
+
+def _search_all(
+    target: SlabGrid,
+    columns: Columns,
+    cell: float,
+    yaws: Float64s,
+    min_overlap: float,
+    workers: int,
+    progress: Progress | None,
+) -> tuple[Float64s, Float64s, Float64s]:
+    """Return the separate peaks of every yaw: poses (M, 3), scores (M,), and (yaw, best) pairs."""
+    reach = float(np.hypot(*columns.xy.T).max())
+    side = 2 * int(np.ceil(reach / cell)) + 2
+    low = np.full(2, -0.5 * side * cell)
+    spectra = transform_target(target, (side, side), workers=workers)
+    n_known = _known_cells(columns, cell)
+    one = partial(
+        _search_yaw,
+        target=target,
+        spectra=spectra,
+        columns=columns,
+        cell=cell,
+        low=low,
+        side=side,
+        min_pairs=min_overlap * n_known,
+    )
+    found = []
+    with ThreadPoolExecutor(max_workers=workers) as pool:
+        for n, peaks in enumerate(pool.map(one, yaws)):
+            found.append(peaks)
+            if progress is not None and n % 16 == 0:
+                progress("search", (n + 1) / len(yaws))
+    pose = np.concatenate([f[:, :3] for f in found])
+    score = np.concatenate([f[:, 3] for f in found])
+    best = np.array([f[:, 3].max(initial=-np.inf) for f in found])
+    return pose, score, np.column_stack([yaws, best])
+
+
+def _known_cells(columns: Columns, cell: float) -> int:
+    """Return how many cells of that width the source knows, unturned."""
+    cells = np.floor(columns.xy / cell).astype(np.int64)
+    return len(np.unique(cells[:, 0] * (1 << 32) + cells[:, 1]))
+
+
+def _search_yaw(
+    yaw: float,
+    *,
+    target: SlabGrid,
+    spectra: Spectra,
+    columns: Columns,
+    cell: float,
+    low: Float64s,
+    side: int,
+    min_pairs: float,
+    n_peaks: int = 6,
+) -> Float64s:
+    """Return the best separate translations at one yaw, (n, 4) x, y, yaw, score."""
+    occupied, known = scatter(
+        columns.xy, columns.occupied, columns.known,
+        float(np.cos(yaw)), float(np.sin(yaw)), cell, low, side, side,
+    )  # fmt: skip
+    score, _ = evidence_surface(spectra, occupied, known, min_overlap=min_pairs, workers=1)
+    index = _local_maxima(score, n_peaks)
+    index = index[index[:, 0] >= 0]
+    xy = target.origin + (index - (side - 1)) * cell - low
+    values = score[index[:, 0], index[:, 1]].astype(np.float64)
+    return np.column_stack([xy, np.full(len(xy), yaw), values])
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _local_maxima(score, n_peaks):  # type: ignore[no-untyped-def]
+    """Return the indices (n_peaks, 2) of the highest 3x3 local maxima, best first, -1 where none."""
+    index = np.full((n_peaks, 2), -1, np.int64)
+    value = np.full(n_peaks, -np.inf)
+    n_u, n_v = score.shape
+    for u in range(n_u):
+        for v in range(n_v):
+            s = score[u, v]
+            if not s > value[-1] or s <= 0.0:
+                continue
+            peak = True
+            for a in range(max(u - 1, 0), min(u + 2, n_u)):
+                for b in range(max(v - 1, 0), min(v + 2, n_v)):
+                    earlier = a < u or (a == u and b < v)
+                    if score[a, b] > s or (earlier and score[a, b] == s):
+                        peak = False
+            if not peak:
+                continue
+            place = n_peaks - 1
+            while place > 0 and s > value[place - 1]:
+                value[place] = value[place - 1]
+                index[place] = index[place - 1]
+                place -= 1
+            value[place] = s
+            index[place, 0], index[place, 1] = u, v
+    return index
+
+
+def _separate(
+    pose: Float64s, score: Float64s, distance: float, yaw: float, n: int
+) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+    """Return the indices of the best poses, best first, no two of them nearer than both limits."""
+    order = np.argsort(-score, kind="stable")
+    order = order[np.isfinite(score[order])]
+    kept: list[int] = []
+    for i in order:
+        if kept:
+            delta = pose[kept] - pose[i]
+            turn = np.abs((delta[:, 2] + np.pi) % (2.0 * np.pi) - np.pi)
+            if ((np.hypot(delta[:, 0], delta[:, 1]) < distance) & (turn < yaw)).any():
+                continue
+        kept.append(int(i))
+        if len(kept) == n:
+            break
+    return np.array(kept, dtype=np.int64)
+
+
+def _climb_all(
+    target: SlabGrid,
+    columns: Columns,
+    pose: Float64s,
+    step: float,
+    yaw_step: float,
+    min_overlap: float,
+    workers: int,
+) -> tuple[Float64s, Float64s, Float64s]:
+    """Return every pose moved to its local maximum on this grid, with score and overlap."""
+    n_known = _known_cells(columns, target.cell)
+    table = xlogx_table(2 * n_known + 64)
+    blocks = np.array_split(np.arange(len(pose)), max(1, min(len(pose), 4 * workers)))
+
+    def climb(block: np.ndarray[tuple[int], np.dtype[np.int64]]) -> Float64s:
+        return np.asarray(
+            _climb(
+                target.occupied, target.known, target.origin, target.cell, columns.xy,
+                columns.occupied, columns.known, columns.n_slabs, pose[block], step, yaw_step,
+                min_overlap * n_known, table,
+            )
+        )  # fmt: skip
+
+    with ThreadPoolExecutor(max_workers=workers) as pool:
+        rows = np.concatenate([np.zeros((0, 5)), *pool.map(climb, blocks)])
+    return rows[:, :3], rows[:, 3], np.minimum(rows[:, 4] / max(n_known, 1), 1.0)
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _climb(  # type: ignore[no-untyped-def]
+    t_occupied, t_known, origin, cell, xy, s_occupied, s_known, n_slabs, poses, step, yaw_step,
+    min_pairs, xlogx,
+):  # fmt: skip
+    """Return (P, 5) x, y, yaw, score, pairs after climbing in steps of `step` and `yaw_step`."""
+    out = np.empty((poses.shape[0], 5))
+    trial = np.empty((27, 3))
+    for p in range(poses.shape[0]):
+        pose = poses[p].copy()
+        best, pairs = -np.inf, 0.0
+        for _ in range(12):
+            m = 0
+            for a in range(-1, 2):
+                for b in range(-1, 2):
+                    for c in range(-1, 2):
+                        trial[m, 0] = pose[0] + a * step
+                        trial[m, 1] = pose[1] + b * step
+                        trial[m, 2] = pose[2] + c * yaw_step
+                        m += 1
+            tables = count_tables(
+                t_occupied, t_known, origin, cell, xy, s_occupied, s_known, n_slabs, trial
+            )
+            winner = -1
+            for m in range(27):
+                most = 0
+                total = 0.0
+                for k in range(n_slabs):
+                    n, r, c, n11 = tables[m, k]
+                    most = max(most, n)
+                    total += signed_evidence(n, r, c, n11, xlogx)
+                if most < min_pairs:
+                    continue
+                if total > best + 1e-9:
+                    best, winner, pairs = total, m, float(most)
+            if winner < 0:
+                break
+            pose = trial[winner].copy()
+            if winner == 13:
+                break
+        out[p, :3], out[p, 3], out[p, 4] = pose, best, pairs
+    return out
