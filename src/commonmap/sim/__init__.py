@@ -1,0 +1,1 @@
+"""Simulated worlds, lidars and missions, with exact truth."""

@@ -1,0 +1,325 @@
+"""Two robots in one simulated place: their maps, each in its own frame, and the exact truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
+
+from commonmap.errors import InputError
+from commonmap.frames import from_rotation, from_xyz_yaw, invert
+from commonmap.sim.missions import Area, Mission, drive, fly
+from commonmap.sim.scanning import (
+    RayCaster,
+    Returns,
+    place_points,
+    scan_world,
+    sensor_positions,
+)
+from commonmap.sim.vlp16 import LidarModel, find_lidar
+from commonmap.sim.world import World
+from commonmap.sim.world import change as change_world
+from commonmap.sim.worlds import build_world
+from commonmap.types import Bools, Cloud, Float64s, Trajectory
+
+OVERLAP_CELL = 0.5
+"""Edge of the cells in which overlap is counted, metres."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """What two robots recorded of one place, and the truth.
+
+    target, source: clouds, each in its own frame, with time, intensity and ray origins.
+    T_target_source: (4, 4) truth. With drift no rigid motion is exact: it is the best one over
+        all points of the source (least squares), so it holds at the middle of the draft.
+    target_trajectory, source_trajectory: poses of the lidar as each robot knows them, own frame.
+    target_mission, source_mission: true poses of the lidar, in the world's frame.
+    T_world_target, T_world_source: truth of each map's frame in the world.
+    overlap: share of the cells (0.5 m, seen from above) that the source saw which the target saw.
+    drift: error of the source's poses over the distance travelled, as applied.
+    """
+
+    kind: str
+    target: Cloud
+    source: Cloud
+    T_target_source: Float64s
+    target_trajectory: Trajectory
+    source_trajectory: Trajectory
+    target_mission: Mission
+    source_mission: Mission
+    T_world_target: Float64s
+    T_world_source: Float64s
+    overlap: float
+    drift: float
+    tilt: float
+    change: float
+    world: World
+    source_world: World
+
+
+def simulate_pair(
+    kind: str,
+    *,
+    rng: np.random.Generator,
+    seed_world: int | None = None,
+    overlap: float = 1.0,
+    drift: float = 0.0,
+    target_drift: float = 0.0,
+    tilt: float = 0.0,
+    change: float = 0.0,
+    lidar_target: str | LidarModel = "vlp16",
+    lidar_source: str | LidarModel = "vlp16",
+    size: float | None = None,
+    relief: float | None = None,
+    draft_size: float | None = None,
+    height: float | None = None,
+    pitch: float | None = None,
+    max_range: float = 40.0,
+    max_points: int = 1_500_000,
+    azimuth_decimation: int = 4,
+) -> Pair:
+    """Return the maps of a drone (target) and a ground robot (source) of one place.
+
+    kind: a name of `WORLDS`. seed_world: seed of the place; drawn from `rng` unless given.
+    overlap: share of the source's cells that the target saw too; less than reachable is had by
+        cutting the target along a line, as the border of a flight does. 1 leaves all there is.
+    drift, target_drift: error of the poses, as share of the distance travelled.
+    tilt: radians by which the source's frame is off level, about a random horizontal axis.
+    change: share of the movable things that changed between the two visits.
+    draft_size: metres, edge of the square that the ground robot drives in; 0.45 of the place
+        unless given. size, relief: metres, of the place. height: metres, of the flight.
+    pitch: radians that the drone's lidar looks down, drawn from 60 to 90 deg unless given.
+    max_range: metres that the ground robot's returns are kept to.
+    max_points: of each cloud; more are thinned at random.
+    azimuth_decimation: fire only every so many firing sequences; the drone, of which half looks
+        at the sky, twice as many.
+    """
+    if not 0.0 < overlap <= 1.0:
+        raise InputError(f"overlap must lie above 0 and up to 1; {overlap} came")
+    if seed_world is None:
+        seed_world = int(rng.integers(2**31))
+    world = build_world(kind, np.random.default_rng(seed_world), size=size, relief=relief)
+    visited = change_world(world, change, rng) if change > 0 else world
+
+    # 1. where each robot goes
+    edge = draft_size if draft_size is not None else 0.45 * world.size
+    room = max(0.0, (world.size - edge) / 2 - 2.0)
+    x, y = rng.uniform(-room, room, 2)
+    draft_area = Area(x, y, edge, edge, rng.uniform(0.0, 2 * np.pi) if room > 0.2 * edge else 0.0)
+    base_area = Area(0.0, 0.0, world.size, world.size, float(rng.integers(4)) * np.pi / 2)
+    ground = drive(visited, draft_area, rng)
+    flight = fly(
+        world, base_area, rng,
+        height=float(rng.uniform(18.0, 30.0)) if height is None else height,
+        pitch=float(np.radians(rng.uniform(60.0, 90.0))) if pitch is None else pitch,
+    )  # fmt: skip
+
+    # 2. what each lidar measures, in the world's frame
+    base = _survey(
+        world, flight, find_lidar(lidar_target), 2.0, rng, max(1, azimuth_decimation // 2)
+    )
+    draft = _survey(visited, ground, find_lidar(lidar_source), 0.8, rng, azimuth_decimation)
+    base = _keep(base, _within(base, 100.0) & base_area.holds(_placed(base, flight)[:, :2]))
+    draft = _keep(draft, _within(draft, max_range))
+    base_true, draft_true = _placed(base, flight), _placed(draft, ground)
+
+    # 3. the border of the flight, so that the overlap is as asked
+    kept = _cut(base_true, draft_true, overlap, draft_area)
+    base, base_true = _keep(base, kept), base_true[kept]
+    base, base_true = _thin(base, base_true, max_points, rng)
+    draft, draft_true = _thin(draft, draft_true, max_points, rng)
+
+    # 4. each robot's own frame and what it believes about its poses
+    T_world_target = random_frame(rng, 0.0)
+    T_world_source = random_frame(rng, tilt)
+    target_known = _known(flight, T_world_target, target_drift, rng)
+    source_known = _known(ground, T_world_source, drift, rng)
+    target, source = _cloud(base, target_known), _cloud(draft, source_known)
+
+    # 5. the truth: exact without drift, the best rigid motion with it
+    T_world_target_fit, T_world_source_fit = T_world_target, T_world_source
+    if target_drift > 0:
+        T_world_target_fit = fit_motion(base_true, target.xyz)
+    if drift > 0:
+        T_world_source_fit = fit_motion(draft_true, source.xyz)
+    return Pair(
+        kind, target, source, invert(T_world_target_fit) @ T_world_source_fit,
+        target_known, source_known, flight, ground, T_world_target_fit, T_world_source_fit,
+        measure_overlap(base_true, draft_true), drift, tilt, change, world, visited,
+    )  # fmt: skip
+
+
+def random_frame(rng: np.random.Generator, tilt: float) -> Float64s:
+    """Return T_world_map of a map that starts anywhere, turned anyhow about z, off level by `tilt`.
+
+    The offset is up to 100 m level and 20 m up; tilt in radians about a random horizontal axis.
+    """
+    x, y = rng.uniform(-100.0, 100.0, 2)
+    T = from_xyz_yaw(x, y, rng.uniform(-20.0, 20.0), rng.uniform(-np.pi, np.pi))
+    about = rng.uniform(0.0, 2 * np.pi)
+    lean = Rotation.from_rotvec(tilt * np.array([np.cos(about), np.sin(about), 0.0]))
+    return T @ from_rotation(lean.as_matrix())
+
+
+def add_drift(
+    trajectory: Trajectory, distance: Float64s, share: float, rng: np.random.Generator
+) -> Trajectory:
+    """Return the poses as a drifting odometry knows them, starting at the true first pose.
+
+    The error grows smoothly: a scale, a turn and a climb that change over some ten metres. It is
+    scaled so that the mean error of position over stretches of 10 m (a quarter of the way, if
+    that is less), as in the KITTI measure, is `share` of their length.
+    """
+    if share == 0.0 or distance[-1] < 1.0:
+        return trajectory
+    at = np.arange(0.0, distance[-1] + 0.5, 0.5)
+    smooth = 12.0 / 0.5
+    noise = gaussian_filter1d(rng.standard_normal((5, len(at))), smooth, axis=1, mode="reflect")
+    noise *= np.sqrt(2 * np.sqrt(np.pi) * smooth)
+    constant = rng.standard_normal((5, 1))
+    raw = noise + 0.4 * constant
+    # scale, sideways, climb as shares; yaw and lean as radians a metre
+    rates = raw * np.array([[0.7], [0.4], [0.35], [0.09], [0.015]])
+    level = _drift_with(trajectory, distance, at, share * rates)
+    for _ in range(3):  # nearly linear in the rates: converges at once
+        rates = rates * (share / max(relative_error(trajectory, level, distance), 1e-12))
+        level = _drift_with(trajectory, distance, at, share * rates)
+    return level
+
+
+def _drift_with(
+    trajectory: Trajectory, distance: Float64s, at: Float64s, rates: Float64s
+) -> Trajectory:
+    """Return the trajectory whose steps carry the errors `rates` (5, K) at distances `at`."""
+    T = trajectory.T_map_sensor
+    rate = np.stack([np.interp(distance, at, row) for row in rates])
+    ds = np.diff(distance, prepend=0.0)
+    yaw = np.cumsum(rate[3] * ds)
+    lean = np.cumsum(rate[4] * ds)
+    turn = Rotation.from_euler("ZY", np.stack([yaw, lean], axis=1)).as_matrix()
+    steps = np.diff(T[:, :3, 3], axis=0)
+    sideways = np.stack([-steps[:, 1], steps[:, 0], 0.0 * steps[:, 2]], axis=1)
+    steps = steps * (1.0 + rate[0, 1:, None]) + sideways * rate[1, 1:, None]
+    steps[:, 2] += rate[2, 1:] * ds[1:]
+    moved = np.einsum("nij,nj->ni", turn[1:], steps)
+    known = T.copy()
+    known[1:, :3, 3] = T[0, :3, 3] + np.cumsum(moved, axis=0)
+    known[:, :3, :3] = turn @ T[:, :3, :3]
+    return Trajectory(trajectory.time, known)
+
+
+def relative_error(
+    true: Trajectory, known: Trajectory, distance: Float64s, *, stretch: float = 10.0
+) -> float:
+    """Return the mean error of position over stretches of the way, as share of their length."""
+    stretch = min(stretch, distance[-1] / 4)
+    starts = np.searchsorted(distance, np.arange(0.0, distance[-1] - stretch, stretch / 4))
+    ends = np.minimum(np.searchsorted(distance, distance[starts] + stretch), len(distance) - 1)
+    T_true = invert(true.T_map_sensor[starts]) @ true.T_map_sensor[ends]
+    T_known = invert(known.T_map_sensor[starts]) @ known.T_map_sensor[ends]
+    error = np.linalg.norm((invert(T_true) @ T_known)[:, :3, 3], axis=1)
+    return float(np.mean(error / (distance[ends] - distance[starts])))
+
+
+def fit_motion(points_a: Float64s, points_b: Float64s) -> Float64s:
+    """Return T_a_b that takes (N, 3) points of b onto those of a with least squares (Kabsch)."""
+    centre_a, centre_b = points_a.mean(axis=0), points_b.mean(axis=0)
+    U, _, Vt = np.linalg.svd((points_a - centre_a).T @ (points_b - centre_b))
+    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
+    R = U @ sign @ Vt
+    return from_rotation(R, centre_a - R @ centre_b)
+
+
+def measure_overlap(target: Float64s, source: Float64s, *, cell: float = OVERLAP_CELL) -> float:
+    """Return the share of the cells seen by the source (N, 3) that the target saw, same frame."""
+    seen_target, seen_source = _cells(target, cell), _cells(source, cell)
+    return float(np.isin(seen_source, seen_target).mean())
+
+
+def _cells(points: Float64s, cell: float) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+    """Return the numbers of the cells that hold points, each once."""
+    at = np.floor(points[:, :2] / cell).astype(np.int64) + 2**20
+    return np.unique(at[:, 0] * 2**21 + at[:, 1])
+
+
+def _survey(
+    world: World, mission: Mission, lidar: LidarModel, spacing: float, rng: np.random.Generator,
+    azimuth_decimation: int,
+) -> Returns:  # fmt: skip
+    """Return the returns of one turn every `spacing` metres of a mission."""
+    last = mission.sensor.time[-1] - 1.0 / lidar.rate
+    stops = np.arange(0.0, mission.distance[-1], spacing)
+    at = mission.sensor.time[np.searchsorted(mission.distance, stops)]
+    stamps = np.unique(at[at <= last])
+    return scan_world(
+        RayCaster(world), mission.sensor, lidar, stamps, rng=rng,
+        azimuth_decimation=azimuth_decimation,
+    )  # fmt: skip
+
+
+def _placed(returns: Returns, mission: Mission) -> Float64s:
+    """Return the points where they truly are, world frame, (N, 3)."""
+    return place_points(mission.sensor, returns.time, returns.xyz)
+
+
+def _within(returns: Returns, max_range: float) -> Bools:
+    """Return which returns are nearer than `max_range` metres."""
+    return np.asarray(np.einsum("ij,ij->i", returns.xyz, returns.xyz) < max_range**2)
+
+
+def _keep(returns: Returns, kept: Bools) -> Returns:
+    """Return the returns where `kept`."""
+    return Returns(
+        returns.xyz[kept], returns.time[kept], returns.ring[kept], returns.intensity[kept],
+        returns.turn[kept], returns.face[kept],
+    )  # fmt: skip
+
+
+def _thin(
+    returns: Returns, true: Float64s, max_points: int, rng: np.random.Generator
+) -> tuple[Returns, Float64s]:
+    """Return at most `max_points` of the returns and of their true places, drawn at random."""
+    if len(true) <= max_points:
+        return returns, true
+    kept = np.zeros(len(true), dtype=bool)
+    kept[rng.choice(len(true), max_points, replace=False)] = True
+    return _keep(returns, kept), true[kept]
+
+
+def _cut(base: Float64s, draft: Float64s, overlap: float, area: Area) -> Bools:
+    """Return which points of the base to keep so that `overlap` of the draft's cells is shared.
+
+    The cut runs across the line from the middle of the place to the draft's area, so that the
+    base keeps the larger part.
+    """
+    if measure_overlap(base, draft) <= overlap:
+        return np.ones(len(base), dtype=bool)
+    away = np.array([area.x, area.y]) + 1e-9
+    away /= np.linalg.norm(away)
+    along = base[:, :2] @ away
+    shared_cells = _cells(draft, OVERLAP_CELL)
+    both = shared_cells[np.isin(shared_cells, _cells(base, OVERLAP_CELL))]
+    centre = np.stack([both // 2**21 - 2**20, both % 2**21 - 2**20], axis=1) + 0.5
+    at = np.sort(centre @ away * OVERLAP_CELL)
+    return np.asarray(along <= at[min(len(at) - 1, round(overlap * len(shared_cells)))])
+
+
+def _known(
+    mission: Mission, T_world_map: Float64s, drift: float, rng: np.random.Generator
+) -> Trajectory:
+    """Return the poses as the robot knows them, in its own frame."""
+    drifted = add_drift(mission.sensor, mission.distance, drift, rng)
+    return Trajectory(drifted.time, invert(T_world_map) @ drifted.T_map_sensor)
+
+
+def _cloud(returns: Returns, known: Trajectory) -> Cloud:
+    """Return the map that a robot makes of its returns with the poses that it knows."""
+    return Cloud(
+        xyz=place_points(known, returns.time, returns.xyz),
+        intensity=returns.intensity,
+        time=returns.time,
+        origin=sensor_positions(known, returns.time).astype(np.float32),
+    )
