@@ -1,0 +1,215 @@
+"""Which way is up, for maps that do not know gravity.
+
+Walls, posts and stems stand upright on any slope. Seen along the true vertical they shrink to lines
+and dots, so the up direction is the one along which the plan of everything above ground is most
+concentrated: most pairs of points share a cell of the plan. The ground only says roughly where up
+is, never exactly: a map of a hillside stays a hillside. How far the verdicts of the map's parts
+scatter says how far the whole is to be trusted.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from scipy.spatial import cKDTree
+
+from commonmap.frames import apply, from_rotation, rotation_between
+from commonmap.mapping.ground import find_ground
+from commonmap.types import Float64s
+
+PRIOR_TILT = math.radians(1.5)
+"""How far from level a map is expected to be that says it is (standard deviation)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Levelling:
+    """T_level_map: (4, 4) rotation about the origin that makes the map level.
+
+    tilt: radians, of the correction. sigma: radians, standard error of the up direction that the
+    upright things give, infinite where there are none. reason: one sentence for the report.
+    """
+
+    T_level_map: Float64s
+    tilt: float
+    sigma: float
+    reason: str
+
+
+def no_levelling(reason: str) -> Levelling:
+    """Return the levelling that changes nothing, with its reason."""
+    return Levelling(np.eye(4), 0.0, math.inf, reason)
+
+
+def find_level(xyz: Float64s) -> Levelling:
+    """Return the rotation that makes an (N, 3) cloud level, identity where nothing upright tells.
+
+    A tilt that is not three times as large as its own standard error is only partly believed
+    (weighed against `PRIOR_TILT`). Deterministic.
+    """
+    if len(xyz) < 200:
+        return no_levelling("too few points to tell which way is up")
+    centred = xyz - np.median(xyz, axis=0)
+
+    # Roughly up: the map's own z, unless another direction has ground under everything
+    points, normals = _patches(centred, 30_000)
+    up, own = _rough_up(points, normals) if len(points) >= 100 else (np.array([0.0, 0.0, 1.0]), True)
+    R_rough = rotation_between(up, (0.0, 0.0, 1.0))
+
+    # Exactly up: the direction along which what stands above ground makes the sharpest plan
+    standing = _standing(centred @ R_rough.T)
+    a, b, sigma = 0.0, 0.0, math.inf
+    if len(standing) >= 500:
+        a, b = _sharpest(standing, 0.0, 0.0, math.radians(12.0 if own else 30.0))
+        sigma = _scatter_of_parts(standing, a, b)
+    tilt = math.hypot(a, b)
+    trust = 1.0 if tilt > 3.0 * sigma else 1.0 / (1.0 + (sigma / PRIOR_TILT) ** 2)
+    if math.isinf(sigma):
+        trust = 0.0
+    direction = np.array([math.tan(trust * a), math.tan(trust * b), 1.0]) @ R_rough
+    R = rotation_between(direction, (0.0, 0.0, 1.0))
+    tilt = math.acos(min(1.0, direction[2] / float(np.linalg.norm(direction))))
+    if own and trust == 0.0:
+        return no_levelling("nothing upright was found; the map's own z is taken as up")
+    how = (
+        f"upright things agree within {math.degrees(sigma):.2f} deg"
+        if trust > 0.0
+        else "the ground lies below; nothing upright was found"
+    )
+    return Levelling(
+        from_rotation(R), tilt, sigma, f"turned by {math.degrees(tilt):.2f} deg: {how}"
+    )
+
+
+def _standing(xyz: Float64s) -> Float64s:
+    """Return one point per voxel of what stands over half a metre above ground, at most 80,000."""
+    ground = find_ground(xyz)
+    above = xyz[xyz[:, 2] - ground.height_at(xyz[:, :2]) > 0.5]
+    if len(above) == 0:
+        return above
+    key = np.floor((above - above.min(axis=0)) / 0.1).astype(np.int64)
+    span = key.max(axis=0) + 1
+    _, first = np.unique((key[:, 0] * span[1] + key[:, 1]) * span[2] + key[:, 2], return_index=True)
+    thin = above[np.sort(first)]
+    return np.ascontiguousarray(thin[:: len(thin) // 80_000 + 1])
+
+
+def _sharpest(xyz: Float64s, a: float, b: float, width: float) -> tuple[float, float]:
+    """Return the tilts (a, b) of the line of sight, x and y per unit of z, of the sharpest plan."""
+    height = max(float(np.ptp(np.quantile(xyz[:, 2], [0.05, 0.95]))), 1.0)
+    cell = max(0.6, width * height / 16.0)
+    finest = max(0.1, math.radians(0.2) * height)
+    while True:
+        n_side = 2 * min(8, max(2, math.ceil(width * height / cell))) + 1
+        steps = np.linspace(-width, width, n_side)
+        score = np.array([[_shared_pairs(xyz, a + i, b + j, cell) for j in steps] for i in steps])
+        i, j = np.unravel_index(int(np.argmax(score)), score.shape)
+        a, b = a + float(steps[i]), b + float(steps[j])
+        if cell <= finest:
+            return a, b
+        width = 1.5 * float(steps[1] - steps[0])
+        cell = max(0.5 * cell, finest)
+
+
+def _scatter_of_parts(xyz: Float64s, a: float, b: float) -> float:
+    """Return the standard error in radians of (a, b), from what each part of the map says alone."""
+    low, high = np.quantile(xyz[:, :2], [0.02, 0.98], axis=0)
+    size = float((high - low).max()) / 4.0
+    ij = np.floor((xyz[:, :2] - low) / max(size, 1e-6)).astype(np.int64)
+    part = ij[:, 0] * 64 + ij[:, 1]
+    found = []
+    for p in np.unique(part):
+        inside = np.ascontiguousarray(xyz[part == p])
+        if len(inside) >= 300:
+            found.append(_sharpest(inside, a, b, math.radians(4.0)))
+    if len(found) < 3:
+        return math.radians(2.0)
+    off = np.array(found) - np.array([a, b])
+    spread = 1.4826 * np.median(np.abs(off), axis=0)
+    # Few parts estimate their own spread badly: half as much again (Student's t, three parts up)
+    return 1.5 * float(np.linalg.norm(np.maximum(spread, 1e-3)) / math.sqrt(len(found)))
+
+
+@numba.njit(cache=True)  # type: ignore[misc]
+def _shared_pairs(xyz, a, b, cell):  # type: ignore[no-untyped-def]
+    """Return how many pairs of points share a plan cell, seen along the direction (a, b, 1)."""
+    n = 1024
+    count = np.zeros((n, n), np.int32)
+    pairs = 0.0
+    tan_a, tan_b = np.tan(a), np.tan(b)
+    for k in range(xyz.shape[0]):
+        i = int(np.floor((xyz[k, 0] - tan_a * xyz[k, 2]) / cell)) & (n - 1)
+        j = int(np.floor((xyz[k, 1] - tan_b * xyz[k, 2]) / cell)) & (n - 1)
+        pairs += count[i, j]
+        count[i, j] += 1
+    return pairs
+
+
+def _patches(xyz: Float64s, n_most: int) -> tuple[Float64s, Float64s]:
+    """Return centres and unit normals (n, 3) of locally flat patches of about 20 thinned points."""
+    extent = float(np.ptp(np.quantile(xyz, [0.02, 0.98], axis=0), axis=0).max())
+    voxel = max(0.05, extent / 1000.0)
+    key = np.floor(xyz / voxel).astype(np.int64)
+    for _ in range(6):
+        _, first = np.unique(key, axis=0, return_index=True) if len(key) < 400_000 else (
+            None, np.arange(0, len(key), len(key) // 400_000 + 1)
+        )  # fmt: skip
+        if len(first) <= 250_000:
+            break
+        voxel *= 1.4
+        key = np.floor(xyz / voxel).astype(np.int64)
+    thin = xyz[np.sort(first)]
+    seeds = thin[:: max(1, len(thin) // n_most)]
+    k = min(20, len(thin))
+    distance, index = cKDTree(thin, balanced_tree=False).query(seeds, k=k, workers=1)
+    near = thin[index] - seeds[:, None, :]
+    near -= near.mean(axis=1, keepdims=True)
+    values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near) / k)
+    flat = (values[:, 0] < 0.08 * values[:, 1]) & (distance[:, -1] < 40.0 * voxel)
+    # A patch along one line has no normal
+    flat &= values[:, 1] > 0.04 * values[:, 2]
+    return seeds[flat], vectors[flat, :, 0]
+
+
+def _rough_up(points: Float64s, normals: Float64s) -> tuple[Float64s, bool]:
+    """Return (up, whether it is the map's own z), by how much ground each hypothesis finds below."""
+    own = np.array([0.0, 0.0, 1.0])
+    best, best_share = own, 1.5 * _ground_share(points, normals, own)
+    rest = normals
+    for _ in range(4):
+        if len(rest) < 50:
+            break
+        sample = rest[:: max(1, len(rest) // 400)]
+        votes = (np.abs(sample @ rest.T) > math.cos(math.radians(12.0))).sum(axis=1)
+        peak = sample[int(np.argmax(votes))]
+        rest = rest[np.abs(rest @ peak) < math.cos(math.radians(25.0))]
+        if abs(peak[2]) > math.cos(math.radians(25.0)):
+            continue
+        for up in (peak, -peak):
+            share = _ground_share(points, normals, up)
+            if share > best_share:
+                best, best_share = up, share
+    return best, best is own
+
+
+def _ground_share(points: Float64s, normals: Float64s, up: Float64s) -> float:
+    """Return the share of columns along `up` whose lowest patch is ground: faces up, much above."""
+    turned = points @ rotation_between(up, (0.0, 0.0, 1.0)).T
+    extent = float(np.ptp(turned[:, :2], axis=0).max())
+    cell = max(extent / 40.0, 0.5)
+    ij = np.floor((turned[:, :2] - turned[:, :2].min(axis=0)) / cell).astype(np.int64)
+    column = ij[:, 0] * 4096 + ij[:, 1]
+    order = np.lexsort((turned[:, 2], column))
+    _, first = np.unique(column[order], return_index=True)
+    lowest = order[first]
+    faces = np.abs(normals[lowest] @ up) > math.cos(math.radians(35.0))
+    below_middle = turned[lowest, 2] <= np.median(turned[:, 2]) + 0.05 * extent
+    n_cells = (int(ij[:, 0].max()) + 1) * (int(ij[:, 1].max()) + 1)
+    return float(np.count_nonzero(faces & below_middle) / n_cells)
+
+
+def apply_level(levelling: Levelling, xyz: Float64s) -> Float64s:
+    """Return the (N, 3) points in the level frame."""
+    return apply(levelling.T_level_map, xyz)
