@@ -107,7 +107,7 @@ def sort(leaves: Leaves) -> tuple[Leaves, Codes]:
 
 
 @numba.njit(cache=True)  # type: ignore[misc]
-def _prune(codes, depth, value, label):  # type: ignore[no-untyped-def]
+def join_siblings(codes, depth, value, label):  # type: ignore[no-untyped-def]
     """Join eight equal sibling leaves into their parent, in place; return how many are left."""
     top = 0
     for n in range(codes.shape[0]):
@@ -152,7 +152,7 @@ def prune_labelled(leaves: Leaves, labels: NDArray[np.int64]) -> tuple[Leaves, N
         labels = labels[np.argsort(encode(leaves.keys), kind="stable")]
     depth, value = ordered.depth.copy(), ordered.log_odds.copy()
     label = labels.astype(np.int64)
-    n = int(_prune(codes, depth, value, label))
+    n = int(join_siblings(codes, depth, value, label))
     pruned = Leaves(leaves.resolution, decode(codes[:n]), depth[:n].copy(), value[:n].copy())
     return pruned, label[:n].copy()
 

@@ -30,7 +30,7 @@ _ADVICE = b"# (feel free to add / change comments, but leave the first line as i
 EXTRA_BYTES: Mapping[str, int] = MappingProxyType(
     {"OcTree": 0, "1": 0, "OcTreeStamped": 0, "ColorOcTree": 3}
 )
-"""Kinds of tree we read: id of the header -> bytes of a node in `.ot` besides value and children."""
+"""Kinds of tree we read: id of the header -> bytes of a `.ot` node beside value and children."""
 
 LOG_ODDS_FREE = np.float32(np.log(0.1192 / (1 - 0.1192)))
 """What a free leaf of a `.bt` file is worth: OctoMap's lower clamping value."""

@@ -1,0 +1,164 @@
+"""Voxels of an octree in blocks of 8^3, and the way from there to pruned leaves and back.
+
+A block holds the log-odds of 512 voxels in Morton order (x the lowest bit, as OctoMap's child
+index), NaN where unknown. Blocks sorted by their own Morton code hold the whole tree in the order
+of OctoMap's files, which makes pruning one pass without a search.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from commonmap.errors import InputError
+from commonmap.io import morton
+from commonmap.types import TREE_DEPTH, Float32s, Leaves
+
+BLOCK = 512
+"""Voxels of a block, 8 along each axis."""
+
+BLOCK_DEPTH = TREE_DEPTH - 3
+"""Depth of the node that a block is."""
+
+MAX_BLOCKS = 1 << 23
+"""The most blocks (2 kB each) that leaves are expanded to."""
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """A voxel map cut into blocks.
+
+    resolution: edge of a voxel, metres.
+    codes: (B,) int64, Morton codes of the blocks' keys (`key >> 3`), rising.
+    values: (B, 512) float32 log-odds in Morton order inside the block, NaN where unknown.
+    """
+
+    resolution: float
+    codes: NDArray[np.int64]
+    values: Float32s
+
+
+def blocks_to_leaves(blocks: Blocks, *, pruned: bool = True) -> Leaves:
+    """Return the leaves of blocks in Morton order; pruned: as coarse as equal values allow."""
+    order = np.arange(len(blocks.codes))
+    return leaves_of(blocks.resolution, blocks.codes, blocks.values, order, pruned=pruned)
+
+
+def leaves_of(
+    resolution: float,
+    codes: NDArray[np.int64],
+    values: Float32s,
+    order: NDArray[np.int64],
+    *,
+    pruned: bool,
+) -> Leaves:
+    """Return the leaves of the blocks `codes[order]`, `values[order]`; `codes[order]` rises."""
+    counts = np.empty(len(order), np.int64)
+    _count_leaves(values, order, pruned, counts)
+    ends = np.cumsum(counts)
+    n = int(ends[-1]) if len(ends) else 0
+    leaf_codes, depth = np.empty(n, np.int64), np.empty(n, np.uint8)
+    value = np.empty(n, np.float32)
+    _fill_leaves(codes, values, order, pruned, ends - counts, leaf_codes, depth, value)
+    if pruned:
+        n = int(morton.join_siblings(leaf_codes, depth, value, np.zeros(n, np.int64)))
+        leaf_codes, depth, value = leaf_codes[:n], depth[:n].copy(), value[:n].copy()
+    return Leaves(resolution, morton.decode(leaf_codes), depth, value)
+
+
+def leaves_to_blocks(leaves: Leaves, *, name: str = "octree") -> Blocks:
+    """Return leaves as blocks, every leaf expanded to voxels of the resolution."""
+    ordered, codes = morton.sort(leaves)
+    n_blocks = int(_count_blocks(codes, ordered.depth))
+    if n_blocks > MAX_BLOCKS:
+        raise InputError(
+            f"{name}: expanded to voxels of {leaves.resolution:g} m it has {n_blocks * BLOCK:.2g}"
+            f" of them, and {MAX_BLOCKS * BLOCK:.2g} are the most this works with"
+        )
+    block_codes = np.empty(n_blocks, np.int64)
+    values = np.full((n_blocks, BLOCK), np.nan, np.float32)
+    _fill_blocks(codes, ordered.depth, ordered.log_odds, block_codes, values)
+    return Blocks(leaves.resolution, block_codes, values)
+
+
+@numba.njit(cache=True, inline="always")  # type: ignore[misc]
+def _uniform(block, start, size):  # type: ignore[no-untyped-def]
+    """Tell whether `size` voxels from `start` are known and equal."""
+    first = block[start]
+    for i in range(start, start + size):  # noqa: SIM110
+        if block[i] != first:
+            return False
+    return first == first
+
+
+@numba.njit(cache=True)  # type: ignore[misc]
+def _count_leaves(values, order, pruned, counts):  # type: ignore[no-untyped-def]
+    for n in range(order.shape[0]):
+        block = values[order[n]]
+        count = 0
+        for group in range(64):
+            known = 0
+            for i in range(group * 8, group * 8 + 8):
+                if block[i] == block[i]:
+                    known += 1
+            if pruned and known == 8 and _uniform(block, group * 8, 8):
+                known = 1
+            count += known
+        counts[n] = count
+
+
+@numba.njit(cache=True)  # type: ignore[misc]
+def _fill_leaves(codes, values, order, pruned, starts, leaf_codes, depth, value):  # type: ignore[no-untyped-def]
+    for n in range(order.shape[0]):
+        block = values[order[n]]
+        base = codes[order[n]] << 9
+        at = starts[n]
+        for group in range(64):
+            i0 = group * 8
+            if pruned and _uniform(block, i0, 8):
+                leaf_codes[at] = base | i0
+                depth[at] = TREE_DEPTH - 1
+                value[at] = block[i0]
+                at += 1
+                continue
+            for i in range(i0, i0 + 8):
+                if block[i] == block[i]:
+                    leaf_codes[at] = base | i
+                    depth[at] = TREE_DEPTH
+                    value[at] = block[i]
+                    at += 1
+
+
+@numba.njit(cache=True)  # type: ignore[misc]
+def _count_blocks(codes, depth):  # type: ignore[no-untyped-def]
+    count = 0
+    last = np.int64(-1)
+    for n in range(codes.shape[0]):
+        if depth[n] <= BLOCK_DEPTH:
+            count += np.int64(1) << (3 * (BLOCK_DEPTH - depth[n]))
+        elif codes[n] >> 9 != last:
+            last = codes[n] >> 9
+            count += 1
+    return count
+
+
+@numba.njit(cache=True)  # type: ignore[misc]
+def _fill_blocks(codes, depth, value, block_codes, values):  # type: ignore[no-untyped-def]
+    at = -1
+    for n in range(codes.shape[0]):
+        code = codes[n] >> 9
+        if depth[n] <= BLOCK_DEPTH:
+            for k in range(np.int64(1) << (3 * (BLOCK_DEPTH - depth[n]))):
+                at += 1
+                block_codes[at] = code + k
+                values[at] = value[n]
+            continue
+        if at < 0 or block_codes[at] != code:
+            at += 1
+            block_codes[at] = code
+        first = codes[n] & 511
+        for i in range(first, first + (1 << (3 * (TREE_DEPTH - depth[n])))):
+            values[at, i] = value[n]
