@@ -89,7 +89,7 @@ def frustum(
     bottom: tuple[float, float], top: tuple[float, float], z_low: float, z_high: float,
     material: str, *, shift: float = 0.0,
 ) -> Mesh:  # fmt: skip
-    """Return a box whose top (length, width) differs from its bottom, shifted along x by `shift`."""
+    """Return a box whose top (length, width) differs from its bottom; `shift` moves it along x."""
     signs = np.array([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]])
     low = np.column_stack([signs * bottom, np.full(4, z_low)])
     high = np.column_stack([signs * top + [shift, 0.0], np.full(4, z_high)])

@@ -241,7 +241,7 @@ def build_mushroom(rng: np.random.Generator) -> Model:
             "concrete",
         ),
     ]
-    return Model(join(parts), (2 * stem + 0.3, 2 * stem + 0.3))
+    return Model(join(parts), (2 * cap, 2 * cap))
 
 
 def build_taper(rng: np.random.Generator) -> Model:

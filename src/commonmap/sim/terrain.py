@@ -36,7 +36,7 @@ class Terrain:
         z01, z11 = self.z[i, j + 1], self.z[i + 1, j + 1]
         below = z00 + u * (z10 - z00) + v * (z11 - z10)
         above = z00 + v * (z01 - z00) + u * (z11 - z01)
-        return np.where(u >= v, below, above)
+        return np.asarray(np.where(u >= v, below, above), dtype=np.float64)
 
     def mesh(self, material: str) -> Mesh:
         """Return the ground as triangles, split along the diagonal of rising x and y."""
@@ -72,7 +72,7 @@ def roll_terrain(
     axis = -size / 2 - margin + cell * np.arange(n)
     x, y = np.meshgrid(axis, axis, indexing="ij")
     n_waves = 24
-    length = np.exp(rng.uniform(*np.log(wavelength), n_waves))
+    length = np.exp(rng.uniform(np.log(wavelength[0]), np.log(wavelength[1]), n_waves))
     heading, phase = rng.uniform(0.0, 2 * np.pi, (2, n_waves))
     z = np.zeros_like(x)
     for a, direction, shift in zip(length, heading, phase, strict=True):
@@ -83,3 +83,17 @@ def roll_terrain(
     z += np.tan(slope) * (x * np.cos(tilt) + y * np.sin(tilt))
     z += roughness * rng.standard_normal(z.shape)
     return Terrain(np.array([axis[0], axis[0]]), cell, z.astype(np.float32))
+
+
+def winding_line(rng: np.random.Generator, size: float) -> Float64s:
+    """Return a winding line across a place, one point about every metre, (N, 2)."""
+    yaw = rng.uniform(0.0, 2 * np.pi)
+    along = np.arange(-0.75 * size, 0.75 * size, 1.0)
+    bend = rng.uniform(4.0, 10.0) * np.sin(
+        along * 2 * np.pi / rng.uniform(60, 140) + rng.uniform(0, 6.28)
+    )
+    across = bend + rng.uniform(-0.12, 0.12) * size
+    c, s = np.cos(yaw), np.sin(yaw)
+    line = np.column_stack([c * along - s * across, s * along + c * across])
+    kept: Float64s = line[np.abs(line).max(axis=1) < size / 2]
+    return kept

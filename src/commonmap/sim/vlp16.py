@@ -82,7 +82,7 @@ def _vlp16() -> LidarModel:
         elevation=np.radians(np.array(elevation_deg, dtype=np.float64)),
         azimuth_offset=np.zeros(16),
         height_offset=np.array(correction_mm) * 1e-3,
-        fire_time=np.arange(16) * 2.304e-6,
+        fire_time=np.arange(16, dtype=np.float64) * 2.304e-6,
         sequence_period=55.296e-6,
     )
 
@@ -97,7 +97,7 @@ def _hdl32() -> LidarModel:
         elevation=np.radians(elevation_deg),
         azimuth_offset=np.zeros(32),
         height_offset=np.zeros(32),
-        fire_time=np.arange(32) * 1.152e-6,
+        fire_time=np.arange(32, dtype=np.float64) * 1.152e-6,
         sequence_period=46.080e-6,
     )
 

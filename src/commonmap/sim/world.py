@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,16 +122,26 @@ class Site:
         self.taken[i, j] = True
 
     def scatter(
-        self, kind: str, n: int, rng: np.random.Generator, *, margin: float = 0.5, tries: int = 30
-    ) -> int:
-        """Put up to `n` things of one kind at random free places; return how many found one."""
+        self, kind: str, n: int, rng: np.random.Generator, *,
+        build: Callable[[np.random.Generator], Model] | None = None,
+        x: tuple[float, float] | None = None, y: tuple[float, float] | None = None,
+        yaw: float | None = None, margin: float = 0.5, tries: int = 30,
+    ) -> int:  # fmt: skip
+        """Put up to `n` things of one kind at random free places; return how many found one.
+
+        build: makes each of them; the row of `OBJECTS` unless given.
+        x, y: metres, the rectangle to stay in; the whole place unless given.
+        yaw: radians; any unless given.
+        """
+        build = OBJECTS[kind] if build is None else build
         found = 0
         for _ in range(n):
-            model = OBJECTS[kind](rng)
-            reach = self.size / 2 - 0.5 * max(model.footprint) - margin - 2 * self.cell
+            model = build(rng)
+            reach = max(0.0, self.size / 2 - 0.5 * max(model.footprint) - margin - 2 * self.cell)
             for _ in range(tries):
-                x, y = rng.uniform(-reach, reach, 2)
-                if self.put(kind, model, x, y, rng.uniform(0.0, 2 * np.pi), margin=margin):
+                at = rng.uniform(*(x or (-reach, reach))), rng.uniform(*(y or (-reach, reach)))
+                turn = rng.uniform(0.0, 2 * np.pi) if yaw is None else yaw
+                if self.put(kind, model, *at, turn, margin=margin):
                     found += 1
                     break
         return found
@@ -247,7 +257,7 @@ def change(world: World, share: float, rng: np.random.Generator) -> World:
     n_ground = int(own.sum())
     n_nodes = world.terrain.z.size
     ground = Mesh(world.vertices[:n_nodes], world.faces[:n_ground], world.face_material[:n_ground])
-    return replace(_assemble(world.name, world.size, world.terrain, ground, pieces))
+    return _assemble(world.name, world.size, world.terrain, ground, pieces)
 
 
 def _own_mesh(world: World, thing: WorldObject) -> Mesh:
