@@ -20,6 +20,9 @@ from commonmap.frames import apply, from_rotation, rotation_between
 from commonmap.mapping.ground import find_ground
 from commonmap.types import Float64s
 
+MAX_SIGMA = math.radians(2.0)
+"""Where the parts of a map disagree by more than this (standard error), nothing upright told."""
+
 PRIOR_TILT = math.radians(1.5)
 """How far from level a map is expected to be that says it is (standard deviation)."""
 
@@ -62,12 +65,12 @@ def find_level(xyz: Float64s) -> Levelling:
     standing = _standing(centred @ R_rough.T)
     a, b, sigma = 0.0, 0.0, math.inf
     if len(standing) >= 500:
-        a, b = _sharpest(standing, 0.0, 0.0, math.radians(12.0 if own else 30.0))
-        sigma = _scatter_of_parts(standing, a, b)
+        a, b = _sharpest(standing, 0.0, 0.0, math.radians(12.0 if own else 30.0), peak_only=True)
+        sigma = math.inf if math.isnan(a) else _scatter_of_parts(standing, a, b)
     tilt = math.hypot(a, b)
     trust = 1.0 if tilt > 3.0 * sigma else 1.0 / (1.0 + (sigma / PRIOR_TILT) ** 2)
-    if math.isinf(sigma):
-        trust = 0.0
+    if sigma > (MAX_SIGMA if own else 2.0 * MAX_SIGMA):
+        a, b, sigma, trust = 0.0, 0.0, math.inf, 0.0
     direction = np.array([math.tan(trust * a), math.tan(trust * b), 1.0]) @ R_rough
     R = rotation_between(direction, (0.0, 0.0, 1.0))
     tilt = math.acos(min(1.0, direction[2] / float(np.linalg.norm(direction))))
@@ -96,8 +99,13 @@ def _standing(xyz: Float64s) -> Float64s:
     return np.ascontiguousarray(thin[:: len(thin) // 80_000 + 1])
 
 
-def _sharpest(xyz: Float64s, a: float, b: float, width: float) -> tuple[float, float]:
-    """Return the tilts (a, b) of the line of sight, x and y per unit of z, of the sharpest plan."""
+def _sharpest(
+    xyz: Float64s, a: float, b: float, width: float, *, peak_only: bool = False
+) -> tuple[float, float]:
+    """Return the tilts (a, b) in radians of the line of sight of the sharpest plan.
+
+    peak_only: return NaN where the sharpest lies on the border of what was looked at.
+    """
     height = max(float(np.ptp(np.quantile(xyz[:, 2], [0.05, 0.95]))), 1.0)
     cell = max(0.6, width * height / 16.0)
     finest = max(0.1, math.radians(0.2) * height)
@@ -106,6 +114,9 @@ def _sharpest(xyz: Float64s, a: float, b: float, width: float) -> tuple[float, f
         steps = np.linspace(-width, width, n_side)
         score = np.array([[_shared_pairs(xyz, a + i, b + j, cell) for j in steps] for i in steps])
         i, j = np.unravel_index(int(np.argmax(score)), score.shape)
+        if peak_only and (min(i, j) == 0 or max(i, j) == n_side - 1):
+            return math.nan, math.nan  # no peak within reach, only a trend
+        peak_only = False
         a, b = a + float(steps[i]), b + float(steps[j])
         if cell <= finest:
             return a, b
@@ -125,7 +136,7 @@ def _scatter_of_parts(xyz: Float64s, a: float, b: float) -> float:
         if len(inside) >= 300:
             found.append(_sharpest(inside, a, b, math.radians(4.0)))
     if len(found) < 3:
-        return math.radians(2.0)
+        return math.inf
     off = np.array(found) - np.array([a, b])
     spread = 1.4826 * np.median(np.abs(off), axis=0)
     # Few parts estimate their own spread badly: half as much again (Student's t, three parts up)

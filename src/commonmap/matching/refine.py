@@ -79,7 +79,7 @@ def refine(
     *,
     cell: float,
     threads: int = 2,
-    n_most: int = 60_000,
+    n_most: int = 40_000,
 ) -> Refined:
     """Return the pose refined on the points, starting from within about one `cell` of the truth.
 
@@ -98,28 +98,18 @@ def refine(
     # Work about the middle of the overlap: small numbers, and rotations that mean something
     centre = 0.5 * (low + high)
     voxel = max(cell / 3.0, 0.03)
-    target = _thin(target_xyz[inside] - centre, voxel, 2 * n_most)
+    target = _thin(target_xyz[inside] - centre, voxel, 3 * n_most)
     source = _thin(moved_source - centre, voxel, n_most)
-    distance_floor = max(cell / 3.0, 0.05)
-    cloud, tree = small_gicp.preprocess_points(
+
+    # Walk from the search's peak on coarse clouds, then settle on fine ones
+    T = _walk(target, source, cell, threads)
+    cloud, _ = small_gicp.preprocess_points(
         target, downsampling_resolution=voxel / 4.0, num_neighbors=12, num_threads=threads
     )
-    draft, _ = small_gicp.preprocess_points(
-        source, downsampling_resolution=voxel / 4.0, num_neighbors=12, num_threads=threads
-    )
-    T = np.eye(4)
-    for reach in (3.0 * cell, 1.5 * cell, max(0.75 * cell, distance_floor)):
-        result = small_gicp.align(
-            cloud, draft, tree, init_T_target_source=T, registration_type="GICP",
-            max_correspondence_distance=reach, num_threads=threads, max_iterations=30,
-        )  # fmt: skip
-        if np.isfinite(result.T_target_source).all() and result.num_inliers >= 20:
-            T = np.asarray(result.T_target_source)
-    normals = np.asarray(cloud.normals())[:, :3]
-    points = np.asarray(cloud.points())[:, :3]
-    T, covariance, rms = _solve_point_to_plane(
-        points, normals, np.asarray(draft.points())[:, :3], T, reach=cell, floor=0.01
-    )
+    points, normals = np.asarray(cloud.points())[:, :3], np.asarray(cloud.normals())[:, :3]
+    covariance, rms = np.eye(6), float("inf")
+    for reach in (1.5 * cell, 0.75 * cell):
+        T, covariance, rms = _solve_point_to_plane(points, normals, source, T, reach=reach)
 
     shift = float(np.linalg.norm(T[:3, 3]))
     turn = float(Rotation.from_matrix(T[:3, :3]).magnitude())
@@ -139,6 +129,28 @@ def refine(
         (shift, turn),
         stayed,
     )
+
+
+def _walk(target: Float64s, source: Float64s, cell: float, threads: int) -> Float64s:
+    """Return the motion of generalised ICP from the identity, on clouds of about 10,000 points."""
+    import small_gicp
+
+    coarse_target, coarse_source = _thin(target, cell / 3.0, 30_000), _thin(source, cell, 10_000)
+    cloud, tree = small_gicp.preprocess_points(
+        coarse_target, downsampling_resolution=cell / 12.0, num_neighbors=12, num_threads=threads
+    )
+    draft, _ = small_gicp.preprocess_points(
+        coarse_source, downsampling_resolution=cell / 12.0, num_neighbors=12, num_threads=threads
+    )
+    T = np.eye(4)
+    for reach in (3.0 * cell, 1.5 * cell):
+        result = small_gicp.align(
+            cloud, draft, tree, init_T_target_source=T, registration_type="GICP",
+            max_correspondence_distance=reach, num_threads=threads, max_iterations=20,
+        )  # fmt: skip
+        if np.isfinite(result.T_target_source).all() and result.num_inliers >= 20:
+            T = np.asarray(result.T_target_source)
+    return T
 
 
 def _unrefined(start: Float64s, source_xyz: Float64s) -> Refined:
@@ -162,7 +174,7 @@ def _thin(xyz: Float64s, voxel: float, n_most: int) -> Float64s:
 
 
 def _solve_point_to_plane(
-    target: Float64s, normals: Float64s, source: Float64s, T: Float64s, *, reach: float, floor: float
+    target: Float64s, normals: Float64s, source: Float64s, T: Float64s, *, reach: float
 ) -> tuple[Float64s, Float64s, float]:
     """Return (T, covariance, rms) of robust Gauss-Newton steps on point-to-plane residuals.
 
@@ -180,7 +192,7 @@ def _solve_point_to_plane(
             return T, np.eye(6), float("inf")
         p, n = moved[hit], normals[index[hit]]
         r = np.einsum("ij,ij->i", n, p - target[index[hit]])
-        scale = max(1.4826 * float(np.median(np.abs(r))), floor)
+        scale = max(1.4826 * float(np.median(np.abs(r))), 0.01)
         w = 1.0 / (1.0 + (r / (2.0 * scale)) ** 2)
         J = np.hstack([n, np.cross(p, n)])
         H = (J * w[:, None]).T @ J + 1e-6 * np.eye(6) * len(p)
