@@ -108,7 +108,8 @@ def sort(leaves: Leaves) -> tuple[Leaves, Codes]:
 
 @numba.njit(cache=True)  # type: ignore[misc]
 def join_siblings(codes, depth, value, label):  # type: ignore[no-untyped-def]
-    """Join eight equal sibling leaves into their parent, in place; return how many are left."""
+    """Join eight sibling leaves of one value and label into their parent, in place; return how many
+    leaves are left. codes: rising."""
     top = 0
     for n in range(codes.shape[0]):
         code, d, v, w = codes[n], depth[n], value[n], label[n]
@@ -132,29 +133,12 @@ def join_siblings(codes, depth, value, label):  # type: ignore[no-untyped-def]
     return top
 
 
-def prune(leaves: Leaves, labels: NDArray[np.int64] | None = None) -> Leaves:
-    """Return the leaves with every eight equal siblings joined, as OctoMap prunes, in Morton order.
-
-    labels: (N,) a further value that must be equal too (who saw the leaf, for example).
-    """
-    return prune_labelled(
-        leaves, np.zeros(len(leaves.depth), np.int64) if labels is None else labels
-    )[0]
-
-
-def prune_labelled(leaves: Leaves, labels: NDArray[np.int64]) -> tuple[Leaves, NDArray[np.int64]]:
-    """Return pruned leaves and the label of each; siblings are joined where labels agree too.
-
-    leaves: in Morton order where labels matter (they are taken in the order given).
-    """
+def prune(leaves: Leaves) -> Leaves:
+    """Return the leaves in Morton order, every eight equal siblings joined, as OctoMap does."""
     ordered, codes = sort(leaves)
-    if ordered is not leaves:
-        labels = labels[np.argsort(encode(leaves.keys), kind="stable")]
     depth, value = ordered.depth.copy(), ordered.log_odds.copy()
-    label = labels.astype(np.int64)
-    n = int(join_siblings(codes, depth, value, label))
-    pruned = Leaves(leaves.resolution, decode(codes[:n]), depth[:n].copy(), value[:n].copy())
-    return pruned, label[:n].copy()
+    n = int(join_siblings(codes, depth, value, np.zeros(len(codes), np.int64)))
+    return Leaves(leaves.resolution, decode(codes[:n]), depth[:n].copy(), value[:n].copy())
 
 
 @numba.njit(cache=True, inline="always")  # type: ignore[misc]

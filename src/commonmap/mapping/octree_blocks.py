@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from commonmap.errors import InputError
 from commonmap.io import morton
+from commonmap.mapping import octree_kernels as kernels
 from commonmap.types import TREE_DEPTH, Float32s, Leaves
 
 BLOCK = 512
@@ -41,10 +42,24 @@ class Blocks:
     values: Float32s
 
 
+NO_LABELS = np.zeros((0, 0), np.int64)
+
+
 def blocks_to_leaves(blocks: Blocks, *, pruned: bool = True) -> Leaves:
     """Return the leaves of blocks in Morton order; pruned: as coarse as equal values allow."""
     order = np.arange(len(blocks.codes))
     return leaves_of(blocks.resolution, blocks.codes, blocks.values, order, pruned=pruned)
+
+
+def blocks_to_labelled_leaves(
+    blocks: Blocks, labels: NDArray[np.int64]
+) -> tuple[Leaves, NDArray[np.int64]]:
+    """Return pruned leaves and the label of each; voxels are joined where labels agree too.
+
+    labels: (B, 512), one for each voxel of the blocks.
+    """
+    order = np.arange(len(blocks.codes))
+    return _leaves(blocks.resolution, blocks.codes, blocks.values, labels, order, True)
 
 
 def leaves_of(
@@ -56,17 +71,38 @@ def leaves_of(
     pruned: bool,
 ) -> Leaves:
     """Return the leaves of the blocks `codes[order]`, `values[order]`; `codes[order]` rises."""
+    return _leaves(resolution, codes, values, NO_LABELS, order, pruned)[0]
+
+
+def _leaves(
+    resolution: float,
+    codes: NDArray[np.int64],
+    values: Float32s,
+    labels: NDArray[np.int64],
+    order: NDArray[np.int64],
+    pruned: bool,
+) -> tuple[Leaves, NDArray[np.int64]]:
     counts = np.empty(len(order), np.int64)
-    _count_leaves(values, order, pruned, counts)
+    _count_leaves(values, labels, order, pruned, counts)
     ends = np.cumsum(counts)
     n = int(ends[-1]) if len(ends) else 0
     leaf_codes, depth = np.empty(n, np.int64), np.empty(n, np.uint8)
-    value = np.empty(n, np.float32)
-    _fill_leaves(codes, values, order, pruned, ends - counts, leaf_codes, depth, value)
+    value, label = np.empty(n, np.float32), np.zeros(n, np.int64)
+    _fill_leaves(
+        codes, values, labels, order, pruned, ends - counts, leaf_codes, depth, value, label
+    )
     if pruned:
-        n = int(morton.join_siblings(leaf_codes, depth, value, np.zeros(n, np.int64)))
+        n = int(morton.join_siblings(leaf_codes, depth, value, label))
         leaf_codes, depth, value = leaf_codes[:n], depth[:n].copy(), value[:n].copy()
-    return Leaves(resolution, morton.decode(leaf_codes), depth, value)
+    return Leaves(resolution, morton.decode(leaf_codes), depth, value), label[:n].copy()
+
+
+def hash_blocks(codes: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """Return a hash table (codes, slots) in which `octree_kernels.probe` finds the blocks."""
+    size = 1 << (2 * len(codes) + 16).bit_length()
+    table = np.full(size, -1, np.int64), np.zeros(size, np.int32)
+    kernels.rehash(codes, len(codes), *table)
+    return table
 
 
 def leaves_to_blocks(leaves: Leaves, *, name: str = "octree") -> Blocks:
@@ -85,17 +121,19 @@ def leaves_to_blocks(leaves: Leaves, *, name: str = "octree") -> Blocks:
 
 
 @numba.njit(cache=True, inline="always")  # type: ignore[misc]
-def _uniform(block, start, size):  # type: ignore[no-untyped-def]
-    """Tell whether `size` voxels from `start` are known and equal."""
-    first = block[start]
-    for i in range(start, start + size):  # noqa: SIM110
-        if block[i] != first:
+def _uniform(values, labels, n, start):  # type: ignore[no-untyped-def]
+    """Tell whether the 8 voxels of block `n` from `start` on are known and equal."""
+    first = values[n, start]
+    for i in range(start, start + 8):
+        if values[n, i] != first:
             return False
-    return first == first
+        if labels.shape[0] and labels[n, i] != labels[n, start]:
+            return False
+    return bool(first == first)
 
 
 @numba.njit(cache=True)  # type: ignore[misc]
-def _count_leaves(values, order, pruned, counts):  # type: ignore[no-untyped-def]
+def _count_leaves(values, labels, order, pruned, counts):  # type: ignore[no-untyped-def]
     for n in range(order.shape[0]):
         block = values[order[n]]
         count = 0
@@ -104,32 +142,33 @@ def _count_leaves(values, order, pruned, counts):  # type: ignore[no-untyped-def
             for i in range(group * 8, group * 8 + 8):
                 if block[i] == block[i]:
                     known += 1
-            if pruned and known == 8 and _uniform(block, group * 8, 8):
+            if pruned and known == 8 and _uniform(values, labels, order[n], group * 8):
                 known = 1
             count += known
         counts[n] = count
 
 
 @numba.njit(cache=True)  # type: ignore[misc]
-def _fill_leaves(codes, values, order, pruned, starts, leaf_codes, depth, value):  # type: ignore[no-untyped-def]
+def _fill_leaves(  # type: ignore[no-untyped-def]
+    codes, values, labels, order, pruned, starts, leaf_codes, depth, value, label
+):
     for n in range(order.shape[0]):
-        block = values[order[n]]
-        base = codes[order[n]] << 9
+        m = order[n]
+        base = codes[m] << 9
         at = starts[n]
         for group in range(64):
-            i0 = group * 8
-            if pruned and _uniform(block, i0, 8):
-                leaf_codes[at] = base | i0
-                depth[at] = TREE_DEPTH - 1
-                value[at] = block[i0]
-                at += 1
-                continue
-            for i in range(i0, i0 + 8):
-                if block[i] == block[i]:
+            i = group * 8
+            last = i + 8
+            joined = pruned and _uniform(values, labels, m, i)
+            while i < last:
+                if values[m, i] == values[m, i]:
                     leaf_codes[at] = base | i
-                    depth[at] = TREE_DEPTH
-                    value[at] = block[i]
+                    depth[at] = TREE_DEPTH - 1 if joined else TREE_DEPTH
+                    value[at] = values[m, i]
+                    if labels.shape[0]:
+                        label[at] = labels[m, i]
                     at += 1
+                i += 8 if joined else 1
 
 
 @numba.njit(cache=True)  # type: ignore[misc]
