@@ -76,9 +76,9 @@ def cloud_of(
     Points without finite coordinates are dropped and counted in the log. Raises `EmptyMapError`
     where none is left, `UnitsError` where the coordinates cannot be metres.
     """
-    xyz = np.stack([columns[axis] for axis in "xyz"], axis=1).astype(np.float64)
-    finite = np.isfinite(xyz).all(axis=1)
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore"):  # signalling NaN
+        xyz = np.stack([columns[axis] for axis in "xyz"], axis=1).astype(np.float64)
+        finite = np.isfinite(xyz).all(axis=1)
         finite &= (np.abs(xyz) <= MAX_COORDINATE).all(axis=1)
     dropped = len(xyz) - int(finite.sum())
     if len(xyz) == 0:
@@ -133,9 +133,10 @@ def columns_of(cloud: Cloud, extra: Mapping[str, Column] | None, path: Path) -> 
 
 def float32_suffices(xyz: Float64s) -> bool:
     """Return whether float32 moves no coordinate by more than a millimetre."""
-    if np.abs(xyz).max(initial=0.0) > 3e38:
+    finite = xyz[np.isfinite(xyz)]
+    if np.abs(finite).max(initial=0.0) > 3e38:
         return False
-    return float(np.abs(xyz - xyz.astype(np.float32)).max(initial=0.0)) <= FLOAT32_LOSS
+    return float(np.abs(finite - finite.astype(np.float32)).max(initial=0.0)) <= FLOAT32_LOSS
 
 
 def check_writable(cloud: Cloud, path: Path) -> None:
@@ -197,7 +198,8 @@ def _origin(columns: Mapping[str, Column]) -> Any:
     names = ("origin_x", "origin_y", "origin_z")
     if not all(name in columns for name in names):
         return None
-    origin = np.stack([columns[name] for name in names], axis=1).astype(np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):
+        origin = np.stack([columns[name] for name in names], axis=1).astype(np.float32)
     return origin if np.isfinite(origin).all() else None
 
 

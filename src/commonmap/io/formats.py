@@ -240,7 +240,6 @@ def find_reader(path: PathLike) -> Reader:
         agrees = (content is None and is_text(head)) or head[:2] in (b"\xff\xfe", b"\xfe\xff")
     else:
         agrees = content in reader.content
-        agrees |= content is None and reader.name == "PCD" and head.startswith(b"#")
     if not agrees:
         raise InputError(f"{path} should be {reader.name} by its suffix, but {looks_like(head)}")
     _require_available(reader)

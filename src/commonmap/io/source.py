@@ -80,8 +80,8 @@ def recognise(head: bytes) -> str | None:
     for signature, name in SIGNATURES:
         if head.startswith(signature):
             return name
-    for line in head.splitlines()[:20]:
-        if line.startswith((b"VERSION ", b"FIELDS ", b"COLUMNS ")) and b"\nDATA " in head:
+    for line in head.splitlines():
+        if line.startswith((b"VERSION ", b"FIELDS ", b"COLUMNS ")):
             return "PCD"
         if line and not line.startswith(b"#"):
             break

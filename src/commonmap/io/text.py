@@ -22,9 +22,10 @@ MAX_LINE = 1 << 16
 
 
 class Layout(NamedTuple):
-    """How a text is laid out. skip: bytes before the first row of numbers. n_claimed: rows its first line says.
+    """How a text is laid out.
 
-    columns: name here -> index; delimiter: None for white space.
+    skip: bytes before the first row of numbers. delimiter: None for white space. columns: name
+    here -> index. n_columns: of the first row. n_claimed: rows that the first line says.
     """
 
     skip: int

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from commonmap.errors import InputError
 from commonmap.frames import quaternion
@@ -83,6 +82,7 @@ def _motions(t: Float64s, q: Float64s) -> Float64s:
     return T
 
 
-def _require(good: NDArray[Any], lines: list[int], message: str) -> None:
-    if not good.all():
+def _require(good: Any, lines: list[int], message: str) -> None:
+    """Raise with the number of the first line where `good`, (M,) bool, is false."""
+    if not np.all(good):
         raise InputError(message % lines[int(np.argmin(good))])
