@@ -300,7 +300,9 @@ def ncc(a: Float64s, b: Float64s) -> float:
 
 
 def zncc(a: Float64s, b: Float64s) -> float:
-    """Zero-mean normalised cross-correlation (Pearson's r), -1 to 1."""
+    """Zero-mean normalised cross-correlation (Pearson's r), -1 to 1; NaN where a side is flat."""
+    if np.ptp(a) == 0.0 or np.ptp(b) == 0.0:
+        return float("nan")
     return cosine(a - a.mean(), b - b.mean())
 
 

@@ -44,12 +44,18 @@ class Sums:
 
     n: cells known in both. A, B: what source and target are divided by (P = a / A, Q = b / B):
     the sums over the overlap, over each map, or 1. values: the sums the plan names, of heights.
+    errors: what rounding may have added to each.
     """
 
     n: Array
     A: Array | float
     B: Array | float
     values: Mapping[str, Array] = field(default_factory=dict)
+    errors: Mapping[str, float] = field(default_factory=dict)
+
+    def above_rounding(self, value: Array, name: str) -> Array:
+        """Return the value, or NaN where it does not stand out from the rounding of sum `name`."""
+        return np.where(value > 30.0 * self.errors.get(name, 0.0), value, np.nan)
 
     def __getitem__(self, name: str) -> Array:
         """Return the sum of that name."""
@@ -116,11 +122,12 @@ class MinSum:
 class RatioSum:
     """`ratio = sum h(|ln(Q / P)|)`: the classes of `ln b - ln a` are counted at every pose.
 
-    slope: a Lipschitz constant of h, which bounds what the quantisation of heights does.
+    slope, bend: bounds of the first derivative of h and, away from 0, of the second.
     """
 
     h: Callable[[Array], Array]
     slope: float
+    bend: float
     combine: Combine
 
 
@@ -185,12 +192,14 @@ def root(x: Array) -> Array:
 
 def kl(s: Sums) -> Array:
     """`sum P ln(P / Q) = (sum a ln(a / b) - ln(A / B) sum a) / A`."""
-    return np.divide(s["a ln(a/b)"] - np.log(s.A / s.B) * s["a"], s.A)
+    score: Array = (s["a ln(a/b)"] - np.log(s.A / s.B) * s["a"]) / s.A
+    return score
 
 
 def jeffreys(s: Sums) -> Array:
     """KL both ways."""
-    return kl(s) + np.divide(s["b ln(b/a)"] - np.log(s.B / s.A) * s["b"], s.B)
+    back: Array = (s["b ln(b/a)"] - np.log(s.B / s.A) * s["b"]) / s.B
+    return kl(s) + back
 
 
 def pearson(s: Sums) -> Array:
@@ -259,7 +268,15 @@ def zssd(s: Sums) -> Array:
 
 
 def zncc(s: Sums) -> Array:
-    """Pearson's r; NaN where a side is flat, to the rounding of its own sum of squares."""
+    """Pearson's r; NaN where a side is flat to the rounding of its own sum of squares."""
     va, vb, cab = variances(s)
-    flat = (va <= 1e-6 * s["aa"]) | (vb <= 1e-6 * s["bb"])
-    return np.where(flat, np.nan, np.clip(divide(cab, root(va * vb)), -1.0, 1.0))
+    va, vb = s.above_rounding(va, "aa"), s.above_rounding(vb, "bb")
+    r: Array = np.clip(cab / np.sqrt(va * vb), -1.0, 1.0)
+    return r
+
+
+def ncc(s: Sums) -> Array:
+    """`sum a b / sqrt(sum a^2 sum b^2)`; NaN where a side is nought to the rounding."""
+    aa, bb = s.above_rounding(s["aa"], "aa"), s.above_rounding(s["bb"], "bb")
+    r: Array = np.clip(s["ab"] / np.sqrt(aa * bb), -1.0, 1.0)
+    return r

@@ -226,13 +226,13 @@ _ROWS = (
     _metric("kulczynski", "Kulczynski", "sum |P-Q| / sum min(P,Q)", f.kulczynski,
             MinSum(lambda s: c.divide(_l1(s), s["min"])), INF, family=L1),
     _metric("canberra", "Canberra", "sum |P-Q|/(P+Q)", f.canberra,
-            RatioSum(lambda s: np.tanh(0.5 * s), 0.5, lambda s: s["ratio"]), INF, family=L1),
+            RatioSum(lambda s: np.tanh(0.5 * s), 0.5, 0.2, lambda s: s["ratio"]), INF, family=L1),
     _metric("lorentzian", "Lorentzian", "sum ln(1 + |P-Q|)", f.lorentzian, None, INF,
             family=L1, note="no function of the ratio P/Q nor of products of P and Q"),
     _metric("intersection", "Intersection", "sum min(P,Q)", f.intersection,
             MinSum(lambda s: s["min"]), 0.0, family=INTERSECTION, best=1.0, maximise=True),
     _metric("wave-hedges", "Wave Hedges", "sum |P-Q|/max(P,Q)", f.wave_hedges,
-            RatioSum(lambda s: -np.expm1(-s), 1.0, lambda s: s["ratio"]), INF,
+            RatioSum(lambda s: -np.expm1(-s), 1.0, 1.0, lambda s: s["ratio"]), INF,
             family=INTERSECTION),
     _metric("motyka", "Motyka", "sum min(P,Q) / sum (P+Q)", f.motyka,
             MinSum(lambda s: c.divide(s["min"], s.P + s.Q)), 0.0, family=INTERSECTION,
@@ -289,8 +289,7 @@ _IMAGE_ROWS = (
     _image("zsad", "Zero-mean absolute difference", "sum |a-b - mean(a-b)| / n", f.zsad,
            DifferenceSum(), best=0.0, worst=INF),
     _image("ncc", "Normalised cross-correlation", "sum ab / sqrt(sum a^2 sum b^2)", f.ncc,
-           Moments(c.SQUARE_TERMS, lambda s: c.divide(c.pq(s), c.root(c.pp(s) * c.qq(s)))),
-           best=1.0, worst=-1.0, maximise=True),
+           Moments(c.SQUARE_TERMS, c.ncc), best=1.0, worst=-1.0, maximise=True),
     _image("zncc", "Zero-mean normalised cross-correlation", "Pearson's r of a and b", f.zncc,
            Moments(c.SQUARE_TERMS, c.zncc, shift_free=True), best=1.0, worst=-1.0,
            maximise=True),
@@ -325,13 +324,14 @@ def check_normalise(metric: Metric, normalise: str) -> Normalise:
     return metric.normalisations[0]
 
 
-def raise_to_floor(metric: Metric, height: Floats, floor: float) -> Floats:
+def raise_to_floor(metric: Metric, height: Floats, floor: float) -> Float64s:
     """Return the heights, no lower than `floor` (metres) where the metric needs positive ones."""
+    lifted: Float64s = np.asarray(height, np.float64)
     if not metric.needs_positive:
-        return height
+        return lifted
     if not floor > 0.0:
         raise InputError(f"the floor of heights must be above 0 m; {floor} came")
-    return np.maximum(height, floor)
+    return np.maximum(lifted, floor)
 
 
 def quantise(height: Floats, low: float, high: float, bins: int) -> Float64s:

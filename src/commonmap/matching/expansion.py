@@ -1,0 +1,239 @@
+"""Functions of a ratio of heights as sums of products, with a certified error.
+
+An f-divergence is `sum P^alpha Q^beta psi(s)`, `s = ln(Q / P) = y - x + g` with x = ln a, y = ln b
+and g = ln(A / B), which changes with the pose. To score all poses by FFT, psi(y - x + g) must
+become a short sum of products of a function of x, one of y and one of g. Three steps, each
+with a proved bound (derivations: docs/metrics-math.md):
+
+1. `expand`: psi is even and smooth, so on |s| <= L it is a Fourier extension
+   `sum_k alpha_k cos(w_k s)`, w_k = k pi / T, T > L, by least squares (Huybrechs 2010).
+2. `separate`: in g, Chebyshev interpolation at J nodes.
+3. `separate`: over x and y + g, the shortest sum of products, by a singular value decomposition.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from commonmap.errors import InputError
+from commonmap.types import Float64s
+
+
+@dataclass(frozen=True, eq=False)
+class Psi:
+    """An even smooth function and a bound on its second derivative over |s| <= L."""
+
+    evaluate: Callable[[Float64s], Float64s]
+    curvature: Callable[[float], float]
+
+
+def _ln_cosh(s: Float64s) -> Float64s:
+    half = 0.5 * np.abs(s)
+    return np.asarray(half + np.log1p(np.exp(-2.0 * half)) - np.log(2.0))
+
+
+PSI: dict[str, Psi] = {
+    # ln cosh(s/2); its second derivative is sech^2(s/2) / 4
+    "ln cosh": Psi(_ln_cosh, lambda L: 0.25),
+    # cosh(s/2) ln cosh(s/2); second derivative (cosh ln cosh + 2 sinh tanh + sech) / 4, at s/2
+    "cosh ln cosh": Psi(
+        lambda s: np.cosh(0.5 * s) * _ln_cosh(s),
+        lambda L: float(np.cosh(0.5 * L) * (0.125 * L + 0.5) + 0.25),
+    ),
+    # sech(s/2); second derivative (sech - 2 sech^3) / 4
+    "sech": Psi(lambda s: 1.0 / np.cosh(0.5 * s), lambda L: 0.25),
+    # sech^2(s/2); second derivative sech^2 - 1.5 sech^4
+    "sech^2": Psi(lambda s: 1.0 / np.cosh(0.5 * s) ** 2, lambda L: 0.5),
+}
+"""The even functions that the Smooth plans of the metric table need."""
+
+MAX_TERMS = 160
+MAX_NODES = 64
+_PERIODS = (1.2, 1.35, 1.5, 1.65, 1.8, 2.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Expansion:
+    """`psi(s) = sum_k alpha[k] cos(omega[k] s)` on |s| <= half_width, to `error` at most."""
+
+    alpha: Float64s
+    omega: Float64s
+    half_width: float
+    error: float
+
+    def __call__(self, s: Float64s) -> Float64s:
+        """Evaluate the sum."""
+        return np.asarray(np.cos(np.multiply.outer(s, self.omega)) @ self.alpha)
+
+
+def certify(psi: Psi, alpha: Float64s, omega: Float64s, L: float, slack: float) -> float:
+    """Return an upper bound of |psi - sum| over |s| <= L.
+
+    On a grid of step h, a function with second derivative at most M exceeds the larger of its
+    neighbours by at most `h^2 M / 8`; h is chosen so that this is `slack`.
+    """
+    M = psi.curvature(L) + float(np.abs(alpha) @ omega**2)
+    n = int(np.ceil(L / np.sqrt(8.0 * slack / M))) + 1
+    h = L / n
+    worst = 0.0
+    for start in range(0, n + 1, 65536):
+        s = h * np.arange(start, min(start + 65536, n + 1), dtype=np.float64)
+        worst = max(worst, float(np.max(np.abs(
+            psi.evaluate(s) - np.cos(np.multiply.outer(s, omega)) @ alpha
+        ))))  # fmt: skip
+    return worst + h * h * M / 8.0
+
+
+@lru_cache(maxsize=256)
+def expand(name: str, half_width: float, tolerance: float) -> Expansion:
+    """Return the shortest expansion of `PSI[name]` on |s| <= half_width within the tolerance.
+
+    Raises `InputError` when no `MAX_TERMS` terms reach it.
+    """
+    psi, L = PSI[name], float(half_width)
+    s = L * np.sin(np.linspace(0.0, 0.5 * np.pi, 2001))
+    value = psi.evaluate(s)
+    closest = float("inf")
+    for terms in range(2, MAX_TERMS):
+        for period in _PERIODS:
+            omega = np.arange(terms, dtype=np.float64) * (np.pi / (period * L))
+            basis = np.cos(np.multiply.outer(s, omega))
+            alpha: Float64s = np.asarray(np.linalg.lstsq(basis, value, rcond=1e-14)[0], np.float64)
+            seen = float(np.max(np.abs(basis @ alpha - value)))
+            if seen < 0.95 * tolerance:
+                error = certify(psi, alpha, omega, L, 0.04 * tolerance)
+                closest = min(closest, error)
+                if error <= tolerance:
+                    return Expansion(alpha, omega, L, error)
+            closest = min(closest, seen)
+    raise InputError(
+        f"heights whose logarithms differ by up to {L:.3g} need a coarser tolerance than "
+        f"{tolerance:.3g}: {MAX_TERMS} terms reach {closest:.3g}; raise the floor or the tolerance"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Separated:
+    """`psi(y - x + g) = sum_m T_m(g') sum_p u_p(x) v_mp(y)`, T_m Chebyshev's polynomials.
+
+    `u_p(x) = source[p] . waves(x)`, `v_mp(y) = target[m, p] . waves(y)`,
+    `waves(x) = [cos(omega x), sin(omega x)]`, `g' = (g - middle) / half` in [-1, 1].
+    error: a bound for x, y, g in their ranges.
+    """
+
+    omega: Float64s
+    source: Float64s
+    target: Float64s
+    middle: float
+    half: float
+    error: float
+
+    def waves(self, x: Float64s) -> Float64s:
+        """Return (2 K, ...) cosines, then sines, of omega times x."""
+        return _waves(self.omega, x)
+
+
+def _waves(omega: Float64s, x: Float64s) -> Float64s:
+    angle = np.multiply.outer(omega, x)
+    return np.concatenate([np.cos(angle), np.sin(angle)])
+
+
+def interpolation_error(expansion: Expansion, half: float, nodes: int) -> float:
+    """Return a bound of Chebyshev interpolation in g of the cosines, over a width of 2 * half.
+
+    Interpolation at J Chebyshev nodes of a function whose J-th derivative is at most D errs by
+    at most `D half^J / (2^(J-1) J!)`; the J-th derivative of `alpha cos(w s)` is `alpha w^J`.
+    """
+    log_factorial = float(np.sum(np.log(np.arange(1, nodes + 1))))
+    log_scale = -(nodes - 1) * np.log(2.0) - log_factorial
+    turns = expansion.omega[1:] * half
+    powers = np.exp(nodes * np.log(np.maximum(turns, 1e-300)) + log_scale)
+    return float(np.abs(expansion.alpha[1:]) @ powers)
+
+
+def _bound_residual(
+    residual: Float64s, omega: Float64s, x: Float64s, z: Float64s, orders: int = 8
+) -> float:
+    """Bound `|waves(x) . residual . waves(z)|` over the ranges that the grids x and z span.
+
+    A function exceeds its grid values by at most half a step times its slope, in x and in z; the
+    slopes are bounded the same way, and those of order `orders` by the sum of the coefficients.
+    """
+    wave = np.concatenate([omega, omega])
+    turn = np.concatenate([np.zeros(omega.size), np.full(omega.size, -0.5 * np.pi)])
+    half_x, half_z = 0.5 * (x[1] - x[0]), 0.5 * (z[1] - z[0])
+
+    def derivatives(grid: Float64s) -> list[Float64s]:
+        angle = np.multiply.outer(wave, grid) + turn[:, None]
+        return [(wave**d)[:, None] * np.cos(angle + 0.5 * np.pi * d) for d in range(orders)]
+
+    on_x, on_z = derivatives(x), derivatives(z)
+    bound = {
+        (i, orders - i): float(wave**i @ np.abs(residual) @ wave ** (orders - i))
+        for i in range(orders + 1)
+    }
+    for order in range(orders - 1, -1, -1):
+        for i in range(order + 1):
+            j = order - i
+            seen = float(np.max(np.abs(on_x[i].T @ residual @ on_z[j])))
+            bound[i, j] = seen + half_x * bound[i + 1, j] + half_z * bound[i, j + 1]
+    return bound[0, 0]
+
+
+@lru_cache(maxsize=64)
+def separate(
+    expansion: Expansion,
+    x_range: tuple[float, float],
+    y_range: tuple[float, float],
+    g_range: tuple[float, float],
+    tolerance: float,
+) -> Separated:
+    """Return the expansion as products of functions of x, y and g, adding at most `tolerance`.
+
+    x_range, y_range: of ln a and ln b. g_range: of ln(A / B); one number twice where it is
+    constant. `|y - x + g| <= expansion.half_width` must hold over the ranges.
+    """
+    alpha, omega = expansion.alpha, expansion.omega
+    middle, half = 0.5 * (g_range[0] + g_range[1]), 0.5 * (g_range[1] - g_range[0])
+    nodes = 1
+    while half > 0.0 and interpolation_error(expansion, half, nodes) > 0.5 * tolerance:
+        nodes += 1
+        if nodes > MAX_NODES:
+            raise InputError(
+                f"the maps' mean heights differ by a factor that spans {np.exp(2.0 * half):.3g} "
+                "over the poses, too much to interpolate; raise the floor or the smallest overlap"
+            )
+    between = interpolation_error(expansion, half, nodes) if half > 0.0 else 0.0
+    lebesgue = 2.0 / np.pi * np.log(nodes) + 1.0
+
+    # psi as a matrix over x and z = y + g; its singular vectors are the shortest sum of products
+    x = np.linspace(*x_range, 301)
+    z = np.linspace(y_range[0] + g_range[0], y_range[1] + g_range[1], 501)
+    exact = np.diag(np.concatenate([alpha, alpha]))  # cos w(z - x) = cos cos + sin sin
+    waves_x, waves_z = _waves(omega, x), _waves(omega, z)
+    left, size, right = np.linalg.svd(waves_x.T @ exact @ waves_z, full_matrices=False)
+    for rank in range(1, 2 * omega.size + 1):
+        source = (exact @ waves_z @ (right[:rank].T / size[:rank])).T  # u_p in the waves of x
+        over_z = left[:, :rank].T @ waves_x.T @ exact  # v_p in the waves of z
+        residual = exact - source.T @ over_z
+        if lebesgue * float(np.max(np.abs(waves_x.T @ residual @ waves_z))) > 0.5 * tolerance:
+            continue
+        lost = lebesgue * _bound_residual(residual, omega, x, z)
+        if lost <= 0.5 * tolerance:
+            break
+    else:
+        source, over_z, lost = np.eye(2 * omega.size), exact, 0.0
+
+    theta = (np.arange(nodes) + 0.5) * (np.pi / nodes)
+    angle = np.multiply.outer(middle + half * np.cos(theta), omega)
+    c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]  # (J, 1, K)
+    of_cos, of_sin = over_z[:, : omega.size], over_z[:, omega.size :]
+    at_nodes = np.concatenate([of_cos * c + of_sin * s, of_sin * c - of_cos * s], axis=-1)
+    to_chebyshev = np.cos(np.multiply.outer(np.arange(nodes), theta)) * (2.0 / nodes)
+    to_chebyshev[0] *= 0.5
+    target = np.einsum("mj,jpk->mpk", to_chebyshev, at_nodes)
+    return Separated(omega, source, target, middle, half, expansion.error + between + lost)

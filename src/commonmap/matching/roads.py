@@ -1,0 +1,333 @@
+"""The roads from a metric's plan to cross-correlations: products, kernels, classes, histograms.
+
+Every road ends in outputs `sum over pairs of (source layer) * (target layer)`, correlated: one
+inverse transform an output, however many pairs. `Products` holds the target's half of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from commonmap.matching import arrays as fourier
+from commonmap.matching.arrays import Array, Arrays
+from commonmap.matching.expansion import Separated, expand, separate
+from commonmap.metrics.plans import BASIS, Term
+from commonmap.types import Bools, Float64s
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """Sizes and settings that all transforms of one prepared target share.
+
+    shape: of the transforms. out_shape: of the surface. dtype: float32 or float64.
+    """
+
+    arrays: Arrays
+    shape: tuple[int, int]
+    source_shape: tuple[int, int]
+    out_shape: tuple[int, int]
+    dtype: type[np.floating]
+
+    @property
+    def rounding(self) -> float:
+        """The error of one correlation is at most about this times the norms of its two layers.
+
+        u log2(N), u the unit roundoff: the standard growth of a transform's rounding with its
+        size N (Higham 2002, section 24.1), here of three transforms and a product.
+        """
+        return 0.5 * float(np.finfo(self.dtype).eps) * float(np.log2(np.prod(self.shape)))
+
+    def source_spectra(self, layers: Float64s, workers: int) -> Array:
+        """Return the spectra of the (m, sx, sy) layers of the source, turned round."""
+        turned = np.ascontiguousarray(layers[:, ::-1, ::-1], dtype=self.dtype)
+        return fourier.transform(self.arrays, self.arrays.xp.asarray(turned), self.shape, workers)
+
+    def target_spectra(self, layers: Float64s, workers: int) -> Array:
+        """Return the spectra of the (m, tx, ty) layers of the target."""
+        placed = self.arrays.xp.asarray(layers.astype(self.dtype))
+        return fourier.transform(self.arrays, placed, self.shape, workers)
+
+    def correlate(self, spectra: Array, workers: int) -> Array:
+        """Return the (m, Sx, Sy) correlations of products of spectra, which are overwritten."""
+        layers = fourier.invert(self.arrays, spectra, self.shape, workers)
+        return fourier.unroll(self.arrays, layers, self.out_shape)
+
+
+def norm(layers: Float64s) -> Float64s:
+    """Return the Euclidean norm of each layer, (m,)."""
+    return np.asarray(np.sqrt(np.sum(layers * layers, axis=(-2, -1))))
+
+
+@dataclass(frozen=True, eq=False)
+class Products:
+    """Outputs that are sums of products of source layers and target layers.
+
+    layers: (h, known) -> the (m, sx, sy) source layers. spectra: of the target layers.
+    pairs: per output, which source layer meets which target layer. target_norm: of each.
+    """
+
+    frame: Frame
+    layers: Callable[[Float64s, Bools], Float64s]
+    spectra: Array
+    pairs: tuple[tuple[tuple[int, int], ...], ...]
+    target_norm: Float64s
+
+    def correlate(
+        self, h: Float64s, known: Bools, *, weights: Float64s | None = None, workers: int = 1
+    ) -> tuple[Array, Float64s]:
+        """Return the outputs (m, Sx, Sy), and what rounding may have added to each, (m,).
+
+        weights: (m,), sums the outputs to a single one before its inverse transform.
+        """
+        layers = self.layers(h, known)
+        U = self.frame.source_spectra(layers, workers)
+        spectra = fourier.multiply_add(self.frame.arrays, U, self.spectra, self.pairs)
+        norms = norm(layers)
+        rounding = self.frame.rounding * np.array(
+            [sum(norms[f] * self.target_norm[w] for f, w in some) for some in self.pairs]
+        )
+        if weights is not None:
+            factor = self.frame.arrays.xp.asarray(weights.astype(self.frame.dtype))
+            spectra = (spectra * factor[:, None, None]).sum(axis=0, keepdims=True)
+            rounding = np.array([np.abs(weights) @ rounding])
+        return self.frame.correlate(spectra, workers), rounding
+
+
+def _evaluate(name: str, h: Float64s, known: Bools, unit: float) -> Float64s:
+    """Return the function `name` of the heights, 0 where not known; logarithms count from unit."""
+    safe = np.where(known, h, 1.0)
+    if name == "ln h":
+        value = np.log(safe / unit)
+    elif name == "h ln h":
+        value = safe * np.log(safe / unit)
+    else:
+        value = BASIS[name](safe)
+    return np.where(known, value, 0.0)
+
+
+def moment_products(
+    frame: Frame,
+    terms: Mapping[str, Sequence[Term]],
+    height_t: Float64s,
+    known_t: Bools,
+    *,
+    unit: float,
+    workers: int,
+) -> Products:
+    """Return the products for the named moments, one output a name, in the order of the names."""
+    source_names = sorted({f for some in terms.values() for _, f, _ in some})
+    wanted: dict[tuple[tuple[float, str], ...], int] = {}
+    pairs = []
+    for some in terms.values():
+        by_source: dict[str, list[tuple[float, str]]] = {}
+        for factor, f, g in some:
+            by_source.setdefault(f, []).append((factor, g))
+        pairs.append(
+            tuple(
+                (source_names.index(f), wanted.setdefault(tuple(combination), len(wanted)))
+                for f, combination in by_source.items()
+            )
+        )
+    stack = np.stack(
+        [
+            sum(
+                (factor * _evaluate(g, height_t, known_t, unit) for factor, g in combination),
+                np.zeros(height_t.shape),
+            )
+            for combination in wanted
+        ]
+    )
+
+    def layers(h: Float64s, known: Bools) -> Float64s:
+        return np.stack([_evaluate(f, h, known, unit) for f in source_names])
+
+    spectra = frame.target_spectra(stack, workers)
+    return Products(frame, layers, spectra, tuple(pairs), norm(stack))
+
+
+# Kernels ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Kernel:
+    """`sum a^alpha b^beta psi(ln b - ln a + g)`: one output a Chebyshev polynomial of g."""
+
+    products: Products
+    separated: Separated
+
+
+@lru_cache(maxsize=64)
+def _split(psi: str, low: float, high: float, g0: float, g1: float, tolerance: float) -> Separated:
+    width = high - low
+    half_width = max(width - g0, width + g1)
+    expansion = expand(psi, half_width, 0.4 * tolerance)
+    return separate(expansion, (low, high), (low, high), (g0, g1), 0.6 * tolerance)
+
+
+def kernel_products(
+    frame: Frame,
+    psi: str,
+    powers: tuple[float, float],
+    log_range: tuple[float, float],
+    g_range: tuple[float, float],
+    tolerance: float,
+    height_t: Float64s,
+    known_t: Bools,
+    workers: int,
+) -> Kernel:
+    """Return the products for a kernel. log_range: of ln h over both maps."""
+    centre = 0.5 * (log_range[0] + log_range[1])
+    low, high = log_range[0] - centre, log_range[1] - centre
+    separated = _split(psi, low, high, g_range[0], g_range[1], tolerance)
+    alpha, beta = powers
+    nodes, rank = separated.target.shape[:2]
+
+    def expand_layers(h: Float64s, known: Bools, rows: Float64s, power: float) -> Float64s:
+        flat = h[known]
+        waves = separated.waves(np.log(flat) - centre)
+        out = np.zeros((rows.shape[0], *h.shape))
+        out[:, known] = (rows @ waves) * flat**power
+        return out
+
+    def layers(h: Float64s, known: Bools) -> Float64s:
+        return expand_layers(h, known, separated.source, alpha)
+
+    spectra, norms = [], []
+    for m in range(nodes):
+        stack = expand_layers(height_t, known_t, separated.target[m], beta)
+        spectra.append(frame.target_spectra(stack, workers))
+        norms.append(norm(stack))
+    pairs = tuple(tuple((p, m * rank + p) for p in range(rank)) for m in range(nodes))
+    W = frame.arrays.xp.concatenate(spectra)
+    return Kernel(Products(frame, layers, W, pairs, np.concatenate(norms)), separated)
+
+
+def chebyshev_sum(values: Array, position: Array) -> Array:
+    """Return `sum_m T_m(position) values[m]` by Clenshaw's recurrence; position in [-1, 1]."""
+    b1, b2 = 0.0 * position, 0.0 * position
+    for m in range(values.shape[0] - 1, 0, -1):
+        b1, b2 = 2.0 * position * b1 - b2 + values[m], b1
+    return position * b1 - b2 + values[0]
+
+
+# Classes ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """Heights cut into `count` equal steps of `low .. high`, of h or of ln h."""
+
+    low: float
+    high: float
+    count: int
+    logarithmic: bool
+
+    @property
+    def step(self) -> float:
+        """The width of a step, in metres or of ln h."""
+        return (self.high - self.low) / self.count
+
+    def index(self, h: Float64s) -> Float64s:
+        """Return the class of each height, 0 .. count - 1."""
+        x = np.log(h) if self.logarithmic else h
+        return np.clip(np.floor((x - self.low) / self.step), 0, self.count - 1)
+
+    def snap(self, h: Float64s) -> Float64s:
+        """Return each height moved to the middle of its class."""
+        middle = self.low + (self.index(h) + 0.5) * self.step
+        return np.exp(middle) if self.logarithmic else middle
+
+
+@dataclass(frozen=True, eq=False)
+class Classes:
+    """The layers of each class: one where a cell is of that class, else zero."""
+
+    frame: Frame
+    steps: Steps
+    spectra: Array
+    target_norm: Float64s
+
+    def source(
+        self, h: Float64s, known: Bools, workers: int, *, weighted: bool = False
+    ) -> tuple[Array, Float64s]:
+        """Return the spectra and the norms of the source's classes, times the heights if asked."""
+        layers = class_layers(self.steps, h, known)
+        if weighted:
+            layers = layers * np.where(known, self.steps.snap(np.where(known, h, 1.0)), 0.0)
+        return self.frame.source_spectra(layers, workers), norm(layers)
+
+    def difference(
+        self,
+        U: Array,
+        weigh: Callable[[Float64s], Float64s],
+        shift: int,
+        workers: int,
+    ) -> Array:
+        """Return `sum_ij weigh((j - i + shift) step) U_i V_j` at every pose, (Sx, Sy)."""
+        xp, count = self.frame.arrays.xp, self.steps.count
+        j = np.arange(count)
+        total = xp.zeros(U.shape[1:], U.dtype)
+        table = weigh((j[None, :] - j[:, None] + shift) * self.steps.step)
+        factor = xp.asarray(table.astype(self.frame.dtype))
+        flat = self.spectra.reshape(count, -1)
+        block = 16384
+        out, u = total.reshape(-1), U.reshape(count, -1)
+        for start in range(0, flat.shape[1], block):
+            part = slice(start, start + block)
+            out[part] = (u[:, part] * (factor @ flat[:, part])).sum(axis=0)
+        return self.frame.correlate(total[None], workers)[0]
+
+
+def class_layers(steps: Steps, h: Float64s, known: Bools) -> Float64s:
+    """Return the (count, nx, ny) layers, one where a known cell is of the class."""
+    index = np.where(known, steps.index(np.where(known, h, 1.0)), -1.0)
+    return np.asarray(
+        index[None] == np.arange(steps.count, dtype=np.float64)[:, None, None], np.float64
+    )
+
+
+def class_products(
+    frame: Frame, steps: Steps, height_t: Float64s, known_t: Bools, workers: int
+) -> Classes:
+    """Return the target's half of the class layers."""
+    layers = class_layers(steps, height_t, known_t)
+    return Classes(frame, steps, frame.target_spectra(layers, workers), norm(layers))
+
+
+def mutual_information(
+    classes: Classes, h: Float64s, known: Bools, known_t: Array, n: Array, workers: int
+) -> Array:
+    """Return the mutual information at every pose from the joint counts, which are whole numbers.
+
+    known_t: the spectrum of the target's mask. Counts of the last row and column follow from
+    those of the others and from the masks.
+    """
+    frame, count = classes.frame, classes.steps.count
+    xp = frame.arrays.xp
+    U, _ = classes.source(h, known, workers)
+    known_s = frame.source_spectra(known[None].astype(np.float64), workers)[0]
+
+    def counted(spectra: Array) -> Array:
+        return xp.maximum(xp.rint(frame.correlate(spectra, workers)), 0.0).astype(np.float64)
+
+    def entropy(counts: Array) -> Array:
+        return counts * np.log(xp.maximum(counts, 1.0))
+
+    columns = counted(known_s[None] * classes.spectra[:-1])
+    last_column = n - columns.sum(axis=0)
+    last_row = columns.copy()
+    total = -entropy(columns).sum(axis=0) - entropy(last_column)
+    rows = xp.zeros_like(total)
+    for i in range(count - 1):
+        joint = counted(U[i][None] * classes.spectra[:-1])
+        row = counted((U[i] * known_t)[None])[0]
+        total += entropy(joint).sum(axis=0) + entropy(row - joint.sum(axis=0)) - entropy(row)
+        last_row -= joint
+        rows += row
+    last = n - rows
+    total += entropy(last_row).sum(axis=0) + entropy(last - last_row.sum(axis=0)) - entropy(last)
+    return xp.maximum(total / xp.maximum(n, 1.0) + np.log(xp.maximum(n, 1.0)), 0.0)
