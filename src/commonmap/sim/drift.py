@@ -28,7 +28,7 @@ def add_drift(
     constant = rng.standard_normal((5, 1))
     raw = noise + 0.4 * constant
     # scale, sideways, climb as shares; yaw and lean as radians a metre
-    rates = raw * np.array([[0.7], [0.4], [0.35], [0.09], [0.015]])
+    rates = raw * np.array([[0.7], [0.4], [0.35], [0.012], [0.004]])
     level = _drift_with(trajectory, distance, at, share * rates)
     for _ in range(3):  # nearly linear in the rates: converges at once
         rates = rates * (share / max(relative_error(trajectory, level, distance), 1e-12))

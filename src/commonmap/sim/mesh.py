@@ -144,9 +144,10 @@ def lathe(profile: Sequence[tuple[float, float]], material: str, *, sides: int =
     )
     i, j = np.meshgrid(np.arange(len(r) - 1), np.arange(sides), indexing="ij")
     a, b = i * sides + j, i * sides + (j + 1) % sides
-    faces = np.concatenate(
-        [np.stack([a, b, a + sides], axis=-1), np.stack([b, b + sides, a + sides], axis=-1)]
-    )
+    # a ring of no radius is a pole: one of the two triangles of each of its cells has no area
+    lower = np.stack([a, b, a + sides], axis=-1)[r[:-1] > 0]
+    upper = np.stack([b, b + sides, a + sides], axis=-1)[r[1:] > 0]
+    faces = np.concatenate([lower.reshape(-1, 3), upper.reshape(-1, 3)])
     return make_mesh(rings, faces, material)
 
 
@@ -163,6 +164,13 @@ def gable(
     for i in range(6):
         j = (i + 1) % 6
         faces += [(i, j, i + 6), (j, j + 6, i + 6)]
+    for o in (0, 6):
+        faces += [
+            (o, o + 1, o + 4),
+            (o, o + 4, o + 5),
+            (o + 1, o + 2, o + 3),
+            (o + 1, o + 3, o + 4),
+        ]
     inner = length / 2
     start = len(vertices)
     for s in (-1, 1):

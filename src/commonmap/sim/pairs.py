@@ -39,7 +39,11 @@ class Pair:
     target_mission, source_mission: true poses of the lidar, in the world's frame.
     T_world_target, T_world_source: truth of each map's frame in the world.
     overlap: share of the cells (0.5 m, seen from above) that the source saw which the target saw.
-    drift: error of the source's poses over the distance travelled, as applied.
+    drift, tilt, change: as asked for.
+    border: (3,) of a line a x + b y = c of the world, beyond which (> c) the target ends; None
+        where it was not cut. reach: metres, of the source's returns.
+    world, source_world: the place as the target, and as the source met it.
+    seed_world: the seed that the place was built from.
     """
 
     kind: str
@@ -56,8 +60,11 @@ class Pair:
     drift: float
     tilt: float
     change: float
+    border: Float64s | None
+    reach: float
     world: World
     source_world: World
+    seed_world: int
 
 
 def simulate_pair(
@@ -127,7 +134,8 @@ def simulate_pair(
     base_true, draft_true = _placed(base, flight), _placed(draft, ground)
 
     # 3. the border of the flight, so that the overlap is as asked
-    kept = _cut(base_true, draft_true, overlap, draft_area)
+    border = _border(base_true, draft_true, overlap, draft_area)
+    kept = before_border(base_true, border)
     base, base_true = _keep(base, kept), base_true[kept]
     base, base_true = _thin(base, base_true, max_points, rng)
     draft, draft_true = _thin(draft, draft_true, max_points, rng)
@@ -148,7 +156,8 @@ def simulate_pair(
     return Pair(
         kind, target, source, invert(T_world_target_fit) @ T_world_source_fit,
         target_known, source_known, flight, ground, T_world_target_fit, T_world_source_fit,
-        measure_overlap(base_true, draft_true), drift, tilt, change, world, visited,
+        measure_overlap(base_true, draft_true), drift, tilt, change,
+        border, max_range, world, visited, seed_world,
     )  # fmt: skip
 
 
@@ -229,22 +238,28 @@ def _thin(
     return _keep(returns, kept), true[kept]
 
 
-def _cut(base: Float64s, draft: Float64s, overlap: float, area: Area) -> Bools:
-    """Return which points of the base to keep so that `overlap` of the draft's cells is shared.
+def before_border(points: Float64s, border: Float64s | None) -> Bools:
+    """Return which of (N, 3) points of the world lie on the target's side of its border."""
+    if border is None:
+        return np.ones(len(points), dtype=bool)
+    return np.asarray(points[:, :2] @ border[:2] <= border[2])
 
-    The cut runs across the line from the middle of the place to the draft's area, so that the
-    base keeps the larger part.
+
+def _border(base: Float64s, draft: Float64s, overlap: float, area: Area) -> Float64s | None:
+    """Return the line at which to end the base so that `overlap` of the draft's cells is shared.
+
+    It runs across the way from the middle of the place to the draft's area, so that the base keeps
+    the larger part. None where the base shares no more than asked anyway.
     """
-    if measure_overlap(base, draft) <= overlap:
-        return np.ones(len(base), dtype=bool)
+    cells = _cells(draft, OVERLAP_CELL)
+    both = cells[np.isin(cells, _cells(base, OVERLAP_CELL))]
+    n_asked = round(overlap * len(cells))
+    if len(both) <= n_asked:
+        return None
     away = np.array([area.x, area.y]) + 1e-9
     away /= np.linalg.norm(away)
-    along = base[:, :2] @ away
-    shared_cells = _cells(draft, OVERLAP_CELL)
-    both = shared_cells[np.isin(shared_cells, _cells(base, OVERLAP_CELL))]
-    centre = np.stack([both // 2**21 - 2**20, both % 2**21 - 2**20], axis=1) + 0.5
-    at = np.sort(centre @ away * OVERLAP_CELL)
-    return np.asarray(along <= at[min(len(at) - 1, round(overlap * len(shared_cells)))])
+    centre = (np.stack([both // 2**21 - 2**20, both % 2**21 - 2**20], axis=1) + 0.5) * OVERLAP_CELL
+    return np.array([*away, np.sort(centre @ away)[n_asked]])
 
 
 def _known(
