@@ -37,8 +37,9 @@ def octree_columns(
     the column; `free_share` and `known_share` float32, the share of its volume that is free, and
     that is free or occupied; `free` bool, not occupied and at least `known_share` of it free.
 
-    An occupied leaf counts where its centre lies, and in every cell and slab whose centre it
-    covers: grid and voxels need not line up, and none is lost or counted in a cell it hardly touches.
+    An occupied voxel counts in the cell and the slab that hold its centre, and in those whose
+    centre it covers: grid and voxels need not line up, and none is lost or counted where it hardly
+    reaches. A coarse leaf counts as its voxels would.
     """
     corner = np.asarray(origin, dtype=np.float64)
     nx, ny = int(shape[0]), int(shape[1])
@@ -50,7 +51,8 @@ def octree_columns(
         raise InputError("ground and slab_edges belong together; only one of them came")
     low, high = _boxes(leaves)
     spans = np.full((4, nx, ny), np.nan, np.float32)
-    _spans(low, high, leaves.occupied, corner, float(cell), spans)
+    half = 0.5 * leaves.resolution
+    _spans(low, high, half, leaves.occupied, corner, float(cell), spans)
     names = ("lowest", "highest", "lowest_free", "highest_free")
     layers: dict[str, NDArray[np.generic]] = dict(zip(names, spans, strict=True))
     if ground is None or slab_edges is None:
@@ -63,7 +65,7 @@ def octree_columns(
     n_slabs = len(edges) - 1
     occupied = np.zeros((n_slabs, nx, ny), np.bool_)
     volume = np.zeros((2, n_slabs, nx, ny), np.float32)
-    _slabs(low, high, leaves.occupied, corner, float(cell), base, edges, occupied, volume)
+    _slabs(low, high, half, leaves.occupied, corner, float(cell), base, edges, occupied, volume)
     volume /= np.float32(cell) ** 2 * np.diff(edges).astype(np.float32)[:, None, None]
     layers["occupied"] = occupied
     layers["free_share"] = volume[0]
@@ -90,13 +92,25 @@ def _boxes(leaves: Leaves) -> tuple[Float64s, Float64s]:
 
 
 @numba.njit(cache=True, inline="always")  # type: ignore[misc]
-def _cells_of(low, high, origin, cell, n):  # type: ignore[no-untyped-def]
-    """Return first and last + 1 cell whose centre a leaf covers, or the cell of its own centre."""
+def _cells_of(low, high, half, origin, cell, n):  # type: ignore[no-untyped-def]
+    """Return first and last + 1 cell that hold the centre of a voxel of the leaf, or whose own
+    centre the leaf covers. half: half of the edge of a voxel."""
     first = np.int64(np.ceil((low - origin) / cell - 0.5 - 1e-6))
     last = np.int64(np.ceil((high - origin) / cell - 0.5 - 1e-6))
-    own = np.int64(np.floor((0.5 * (low + high) - origin) / cell + 1e-6))
-    first, last = min(first, own), max(last, own + 1)
+    first = min(first, np.int64(np.floor((low + half - origin) / cell + 1e-6)))
+    last = max(last, np.int64(np.floor((high - half - origin) / cell + 1e-6)) + 1)
     return max(first, 0), min(last, n)
+
+
+@numba.njit(cache=True, inline="always")  # type: ignore[misc]
+def _in_slab(bottom, top, half, start, end):  # type: ignore[no-untyped-def]
+    """Tell whether a slab holds the centre of a voxel of the leaf or has its own in the leaf."""
+    step = max(np.ceil((start - bottom - half) / (2.0 * half) - 1e-6), 0.0)
+    centre = bottom + half + 2.0 * half * step
+    if centre < top and centre < end - 1e-6 * half:
+        return True
+    middle = 0.5 * (start + end)
+    return bottom <= middle and middle < top
 
 
 @numba.njit(cache=True, inline="always")  # type: ignore[misc]
@@ -108,11 +122,11 @@ def _cells_met(low, high, origin, cell, n):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)  # type: ignore[misc]
-def _spans(low, high, occupied, origin, cell, spans):  # type: ignore[no-untyped-def]
+def _spans(low, high, half, occupied, origin, cell, spans):  # type: ignore[no-untyped-def]
     nx, ny = spans.shape[1], spans.shape[2]
     for n in range(low.shape[0]):
-        i0, i1 = _cells_of(low[n, 0], high[n, 0], origin[0], cell, nx)
-        j0, j1 = _cells_of(low[n, 1], high[n, 1], origin[1], cell, ny)
+        i0, i1 = _cells_of(low[n, 0], high[n, 0], half, origin[0], cell, nx)
+        j0, j1 = _cells_of(low[n, 1], high[n, 1], half, origin[1], cell, ny)
         layer = 0 if occupied[n] else 2
         for i in range(i0, i1):
             for j in range(j0, j1):
@@ -129,15 +143,15 @@ def _overlap(low, high, start, end):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True)  # type: ignore[misc]
 def _slabs(  # type: ignore[no-untyped-def]
-    low, high, occupied, origin, cell, ground, edges, any_occupied, volume
+    low, high, half, occupied, origin, cell, ground, edges, any_occupied, volume
 ):
     nx, ny = ground.shape
     n_slabs = edges.shape[0] - 1
     for n in range(low.shape[0]):
         i0, i1 = _cells_met(low[n, 0], high[n, 0], origin[0], cell, nx)
         j0, j1 = _cells_met(low[n, 1], high[n, 1], origin[1], cell, ny)
-        ci0, ci1 = _cells_of(low[n, 0], high[n, 0], origin[0], cell, nx)
-        cj0, cj1 = _cells_of(low[n, 1], high[n, 1], origin[1], cell, ny)
+        ci0, ci1 = _cells_of(low[n, 0], high[n, 0], half, origin[0], cell, nx)
+        cj0, cj1 = _cells_of(low[n, 1], high[n, 1], half, origin[1], cell, ny)
         layer = 1 if occupied[n] else 0
         for i in range(i0, i1):
             x0 = origin[0] + i * cell
@@ -149,7 +163,6 @@ def _slabs(  # type: ignore[no-untyped-def]
                 area = dx * _overlap(low[n, 1], high[n, 1], y0, y0 + cell)
                 counts = occupied[n] and ci0 <= i < ci1 and cj0 <= j < cj1
                 bottom, top = low[n, 2] - ground[i, j], high[n, 2] - ground[i, j]
-                middle = 0.5 * (bottom + top)
                 s = np.searchsorted(edges, bottom, side="right") - 1
                 for slab in range(max(s, 0), n_slabs):
                     if edges[slab] >= top:
@@ -157,8 +170,5 @@ def _slabs(  # type: ignore[no-untyped-def]
                     volume[layer, slab, i, j] += area * _overlap(
                         bottom, top, edges[slab], edges[slab + 1]
                     )
-                    if counts:
-                        centre = 0.5 * (edges[slab] + edges[slab + 1])
-                        own = edges[slab] <= middle + 1e-9 and middle + 1e-9 < edges[slab + 1]
-                        if own or (bottom <= centre and centre < top):
-                            any_occupied[slab, i, j] = True
+                    if counts and _in_slab(bottom, top, half, edges[slab], edges[slab + 1]):
+                        any_occupied[slab, i, j] = True

@@ -154,22 +154,20 @@ def cast(  # type: ignore[no-untyped-def]
                     end[n, a] = origin[a]
                 else:
                     end[n, a] = (np.float64(key[a] - KEY_ORIGIN) + 0.5) * resolution
+            if not first and max_range > 0:
+                distance = 0.0
+                for a in range(3):
+                    distance += np.float64((end[n, a] - origin[a]) * (end[n, a] - origin[a]))
+                if distance > max_range * max_range:
+                    break
             if value > 0:
                 hit[n] = True
                 break
             if value != value and not ignore_unknown:
                 break
-            if not first and max_range > 0:
-                distance = 0.0
-                for a in range(3):
-                    distance += (np.float64(end[n, a]) - np.float64(origin[a])) ** 2
-                if distance > max_range * max_range:
-                    break
             first = False
             a = (0 if t[0] < t[2] else 2) if t[0] < t[1] else (1 if t[1] < t[2] else 2)
-            if t[a] == FAR:
+            if t[a] == FAR or key[a] + step[a] < 0 or key[a] + step[a] >= KEY_LIMIT:
                 break
             key[a] += step[a]
             t[a] += dt[a]
-            if key[a] < 0 or key[a] >= KEY_LIMIT:
-                break
