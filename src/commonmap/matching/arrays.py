@@ -87,46 +87,60 @@ def invert(arrays: Arrays, spectra: Array, shape: tuple[int, int], workers: int)
     return arrays.fft.irfft(columns, n=shape[1], axis=-1, **options)
 
 
-def unroll(arrays: Arrays, layers: Array, out_shape: tuple[int, int]) -> Array:
-    """Return the layers cut, or filled with zeros where they wrapped, to (m, Sx, Sy)."""
-    m, nx, ny = layers.shape
-    sx, sy = out_shape
-    if nx >= sx and ny >= sy:
-        return layers[:, :sx, :sy]
-    out = arrays.xp.zeros((m, sx, sy), layers.dtype)
-    out[:, : min(nx, sx), : min(ny, sy)] = layers[:, :sx, :sy]
-    return out
-
-
-@numba.njit(cache=True, nogil=True)
-def _multiply_add(U: Array, W: Array, first: Array, f: Array, w: Array, out: Array) -> None:
+@numba.njit(cache=True, nogil=True, fastmath={"contract", "nsz"})
+def _multiply_add(
+    U: Array, W: Array, first: Array, f: Array, w: Array, out: Array
+) -> None:  # pragma: no cover
+    """out[m] = sum U[f] W[w]; U, out: (., F, 2) interleaved, W: (., 2, F) planar. In blocks that
+    stay in the cache; each element's sum runs in the order of the pairs, whatever the block."""
     n = U.shape[1]
-    block = 2048
+    block = 1024
+    u = np.empty((U.shape[0], 2, block), U.dtype)
+    total = np.empty((2, block), U.dtype)
     for start in range(0, n, block):
-        stop = min(start + block, n)
+        size = min(block, n - start)
+        for k in range(U.shape[0]):
+            for i in range(size):
+                u[k, 0, i] = U[k, start + i, 0]
+                u[k, 1, i] = U[k, start + i, 1]
         for m in range(out.shape[0]):
+            for i in range(size):
+                total[0, i] = 0.0
+                total[1, i] = 0.0
             for k in range(first[m], first[m + 1]):
-                fk, wk = f[k], w[k]
-                if k == first[m]:
-                    for i in range(start, stop):
-                        out[m, i] = U[fk, i] * W[wk, i]
-                else:
-                    for i in range(start, stop):
-                        out[m, i] += U[fk, i] * W[wk, i]
+                re, im = u[f[k], 0], u[f[k], 1]
+                wr, wi = W[w[k], 0, start : start + size], W[w[k], 1, start : start + size]
+                for i in range(size):
+                    total[0, i] += re[i] * wr[i] - im[i] * wi[i]
+                    total[1, i] += re[i] * wi[i] + im[i] * wr[i]
+            for i in range(size):
+                out[m, start + i, 0] = total[0, i]
+                out[m, start + i, 1] = total[1, i]
+
+
+def pack(arrays: Arrays, spectra: Array) -> Array:
+    """Return spectra as `multiply_add` wants the target's: on the CPU, real and imaginary apart."""
+    if arrays.name != "numpy":
+        return spectra
+    flat = spectra.reshape(spectra.shape[0], -1)
+    return np.stack([flat.real, flat.imag], axis=1)
 
 
 def multiply_add(
     arrays: Arrays, U: Array, W: Array, pairs: Sequence[Sequence[tuple[int, int]]]
 ) -> Array:
-    """Return, for each list of pairs (f, w), the spectrum `sum U[f] * W[w]`; (m, Nx, Ny//2+1)."""
+    """Return, per list of pairs (f, w), the spectrum `sum U[f] * W[w]`; W as `pack` returns it."""
     shape = (len(pairs), *U.shape[1:])
     if arrays.name == "numpy":
         out = np.empty(shape, U.dtype)
         flat = [pair for some in pairs for pair in some]
         first = np.cumsum([0, *(len(some) for some in pairs)])
         f, w = (np.array([pair[k] for pair in flat]) for k in (0, 1))
-        size = int(np.prod(U.shape[1:]))
-        _multiply_add(U.reshape(-1, size), W.reshape(-1, size), first, f, w, out.reshape(-1, size))
+        real = W.dtype
+        _multiply_add(
+            U.view(real).reshape(U.shape[0], -1, 2), W, first, f, w,
+            out.view(real).reshape(len(pairs), -1, 2),
+        )  # fmt: skip
         return out
     out = arrays.xp.zeros(shape, U.dtype)
     for m, some in enumerate(pairs):

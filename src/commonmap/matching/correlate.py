@@ -180,8 +180,8 @@ def prepare_target(
     unit, offset = float(np.sqrt(floor * max(high, floor))), 0.0
     cut: roads.Classes | None = None
     if isinstance(plan, Moments | Smooth):
-        terms.update(plan.terms)
-        if reading == "overlap" or isinstance(plan, Smooth):
+        terms.update(plan.terms if isinstance(plan, Moments) else {**A_SUM, **B_SUM})
+        if reading == "overlap":
             terms.update({**A_SUM, **B_SUM})
         if isinstance(plan, Moments) and plan.shift_free:
             offset = float(height[known].mean())
@@ -248,7 +248,6 @@ def _count(
         if length < all_shifts:
             rim = (slice(None),) * axis
             n[(*rim, slice(0, all_shifts - length))] = 0.0
-            n[(*rim, slice(length, None))] = 0.0
     return n, n >= prepared.min_cells
 
 
@@ -273,7 +272,7 @@ def score_surface(
     # the moments over the overlap of every pose, (Sx, Sy) each; the first is the number of cells
     outputs, rounding = prepared.moments.correlate(h, known, workers=workers)
     n, counted = _count(prepared, outputs[0], float(rounding[0]), known, workers)
-    n_overlap = frame.arrays.to_host(n.astype(np.int32))
+    n_overlap = frame.place(n.astype(np.int32), 0)
     if not bool(counted.any()):
         nothing = np.full(frame.out_shape, np.nan)
         return Surface(nothing, n_overlap, frame.source_shape, nothing if bound else None)
@@ -310,8 +309,8 @@ def score_surface(
                 pairs.append((score(values, 1.0), score(values, -1.0)))
             for up, down in pairs:
                 spread = spread + xp.fmax(np.abs(up - result), np.abs(down - result))
-            spread = frame.arrays.to_host(xp.where(counted, spread, np.nan))
-        result = frame.arrays.to_host(xp.where(counted, result, np.nan))
+            spread = frame.place(xp.where(counted, spread, np.nan), np.nan)
+        result = frame.place(xp.where(counted, result, np.nan), np.nan)
     return Surface(result, n_overlap, frame.source_shape, spread)
 
 

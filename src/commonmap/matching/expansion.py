@@ -44,6 +44,12 @@ PSI: dict[str, Psi] = {
         lambda s: np.cosh(0.5 * s) * _ln_cosh(s),
         lambda L: float(np.cosh(0.5 * L) * (0.125 * L + 0.5) + 0.25),
     ),
+    # Topsoe's s sinh(s/2) - 2 cosh(s/2) ln cosh(s/2); the first part's second derivative is
+    # cosh(s/2) + s/4 sinh(s/2)
+    "topsoe": Psi(
+        lambda s: s * np.sinh(0.5 * s) - 2.0 * np.cosh(0.5 * s) * _ln_cosh(s),
+        lambda L: float(np.cosh(0.5 * L) * (0.5 * L + 2.0) + 0.5),
+    ),
     # sech(s/2); second derivative (sech - 2 sech^3) / 4
     "sech": Psi(lambda s: 1.0 / np.cosh(0.5 * s), lambda L: 0.25),
     # sech^2(s/2); second derivative sech^2 - 1.5 sech^4
@@ -118,10 +124,10 @@ def expand(name: str, half_width: float, tolerance: float) -> Expansion:
 
 @dataclass(frozen=True, eq=False)
 class Separated:
-    """`psi(y - x + g) = sum_m T_m(g') sum_p u_p(x) v_mp(y)`, T_m Chebyshev's polynomials.
+    """`(psi + linear)(y - x + g) = sum_m T_m(g') sum_p u_p(x) v_mp(y)`, T_m Chebyshev's.
 
     `u_p(x) = source[p] . waves(x)`, `v_mp(y) = target[m, p] . waves(y)`,
-    `waves(x) = [cos(omega x), sin(omega x)]`, `g' = (g - middle) / half` in [-1, 1].
+    `waves(x) = [cos(omega x), sin(omega x), x]`, `g' = (g - middle) / half` in [-1, 1].
     error: a bound for x, y, g in their ranges.
     """
 
@@ -133,13 +139,15 @@ class Separated:
     error: float
 
     def waves(self, x: Float64s) -> Float64s:
-        """Return (2 K, ...) cosines, then sines, of omega times x."""
+        """Return (2 K + 1, ...) cosines, then sines, of omega times x, then x."""
         return _waves(self.omega, x)
 
 
 def _waves(omega: Float64s, x: Float64s) -> Float64s:
-    angle = np.multiply.outer(omega, x)
-    return np.concatenate([np.cos(angle), np.sin(angle)])
+    turn = np.empty((omega.size, *x.shape), np.complex128)  # powers: omega[k] = k omega[1]
+    turn[0], turn[1:] = 1.0, np.exp(1j * omega[1] * x)
+    np.cumprod(turn, axis=0, out=turn)
+    return np.concatenate([turn.real, turn.imag, x[None]])
 
 
 def interpolation_error(expansion: Expansion, half: float, nodes: int) -> float:
@@ -167,13 +175,20 @@ def _bound_residual(
     turn = np.concatenate([np.zeros(omega.size), np.full(omega.size, -0.5 * np.pi)])
     half_x, half_z = 0.5 * (x[1] - x[0]), 0.5 * (z[1] - z[0])
 
-    def derivatives(grid: Float64s) -> list[Float64s]:
+    def derivative(grid: Float64s, d: int) -> Float64s:
         angle = np.multiply.outer(wave, grid) + turn[:, None]
-        return [(wave**d)[:, None] * np.cos(angle + 0.5 * np.pi * d) for d in range(orders)]
+        straight = grid if d == 0 else np.full_like(grid, float(d == 1))
+        waves = (wave**d)[:, None] * np.cos(angle + 0.5 * np.pi * d)
+        return np.concatenate([waves, straight[None]])
 
-    on_x, on_z = derivatives(x), derivatives(z)
+    def largest(grid: Float64s, d: int) -> Float64s:
+        straight = float(np.max(np.abs(grid))) if d == 0 else float(d == 1)
+        return np.append(wave**d, straight)
+
+    on_x = [derivative(x, d) for d in range(orders)]
+    on_z = [derivative(z, d) for d in range(orders)]
     bound = {
-        (i, orders - i): float(wave**i @ np.abs(residual) @ wave ** (orders - i))
+        (i, orders - i): float(largest(x, i) @ np.abs(residual) @ largest(z, orders - i))
         for i in range(orders + 1)
     }
     for order in range(orders - 1, -1, -1):
@@ -191,15 +206,16 @@ def separate(
     y_range: tuple[float, float],
     g_range: tuple[float, float],
     tolerance: float,
+    linear: float = 0.0,
 ) -> Separated:
-    """Return the expansion as products of functions of x, y and g, adding at most `tolerance`.
+    """Return the expansion plus `linear * s` as products, adding at most `tolerance`.
 
     x_range, y_range: of ln a and ln b. g_range: of ln(A / B); one number twice where it is
     constant. `|y - x + g| <= expansion.half_width` must hold over the ranges.
     """
     alpha, omega = expansion.alpha, expansion.omega
     middle, half = 0.5 * (g_range[0] + g_range[1]), 0.5 * (g_range[1] - g_range[0])
-    nodes = 1
+    nodes = 2 if half > 0.0 and linear else 1
     while half > 0.0 and interpolation_error(expansion, half, nodes) > 0.5 * tolerance:
         nodes += 1
         if nodes > MAX_NODES:
@@ -213,10 +229,11 @@ def separate(
     # psi as a matrix over x and z = y + g; its singular vectors are the shortest sum of products
     x = np.linspace(*x_range, 301)
     z = np.linspace(y_range[0] + g_range[0], y_range[1] + g_range[1], 501)
-    exact = np.diag(np.concatenate([alpha, alpha]))  # cos w(z - x) = cos cos + sin sin
+    exact = np.diag(np.concatenate([alpha, alpha, [0.0]]))  # cos w(z - x) = cos cos + sin sin
+    exact[0, -1], exact[-1, 0] = linear, -linear  # linear (z - x)
     waves_x, waves_z = _waves(omega, x), _waves(omega, z)
     left, size, right = np.linalg.svd(waves_x.T @ exact @ waves_z, full_matrices=False)
-    for rank in range(1, 2 * omega.size + 1):
+    for rank in range(1, 2 * omega.size + 2):
         source = (exact @ waves_z @ (right[:rank].T / size[:rank])).T  # u_p in the waves of x
         over_z = left[:, :rank].T @ waves_x.T @ exact  # v_p in the waves of z
         residual = exact - source.T @ over_z
@@ -226,13 +243,15 @@ def separate(
         if lost <= 0.5 * tolerance:
             break
     else:
-        source, over_z, lost = np.eye(2 * omega.size), exact, 0.0
+        source, over_z, lost = np.eye(2 * omega.size + 1), exact, 0.0
 
     theta = (np.arange(nodes) + 0.5) * (np.pi / nodes)
     angle = np.multiply.outer(middle + half * np.cos(theta), omega)
     c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]  # (J, 1, K)
-    of_cos, of_sin = over_z[:, : omega.size], over_z[:, omega.size :]
-    at_nodes = np.concatenate([of_cos * c + of_sin * s, of_sin * c - of_cos * s], axis=-1)
+    of_cos, of_sin, of_z = over_z[:, : omega.size], over_z[:, omega.size : -1], over_z[:, -1:]
+    straight = np.broadcast_to(of_z, (nodes, *of_z.shape))
+    at_nodes = np.concatenate([of_cos * c + of_sin * s, of_sin * c - of_cos * s, straight], axis=-1)
+    at_nodes[..., 0] += of_z[:, 0] * (middle + half * np.cos(theta))[:, None]  # z = y + g
     to_chebyshev = np.cos(np.multiply.outer(np.arange(nodes), theta)) * (2.0 / nodes)
     to_chebyshev[0] *= 0.5
     target = np.einsum("mj,jpk->mpk", to_chebyshev, at_nodes)

@@ -10,12 +10,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
+import numba
 import numpy as np
 
 from commonmap.matching import arrays as fourier
 from commonmap.matching.arrays import Array, Arrays
 from commonmap.matching.expansion import Separated, expand, separate
-from commonmap.metrics.plans import BASIS, Term
+from commonmap.metrics.plans import BASIS, Smooth, Term
 from commonmap.types import Bools, Float64s
 
 
@@ -52,9 +53,21 @@ class Frame:
         return fourier.transform(self.arrays, placed, self.shape, workers)
 
     def correlate(self, spectra: Array, workers: int) -> Array:
-        """Return the (m, Sx, Sy) correlations of products of spectra, which are overwritten."""
+        """Return the correlations (m, ...) of products of spectra, which are overwritten.
+
+        The surface as far as the transforms tell its shifts apart; `place` makes it whole.
+        """
         layers = fourier.invert(self.arrays, spectra, self.shape, workers)
-        return fourier.unroll(self.arrays, layers, self.out_shape)
+        return layers[:, : self.out_shape[0], : self.out_shape[1]]
+
+    def place(self, seen: Array, fill: float) -> Array:
+        """Return what `correlate` gave for one layer as the whole surface, on the host."""
+        host = self.arrays.to_host(seen)
+        if host.shape == self.out_shape:
+            return host
+        whole = np.full(self.out_shape, fill, host.dtype)
+        whole[: host.shape[0], : host.shape[1]] = host
+        return whole
 
 
 def norm(layers: Float64s) -> Float64s:
@@ -67,7 +80,8 @@ class Products:
     """Outputs that are sums of products of source layers and target layers.
 
     layers: (h, known) -> the (m, sx, sy) source layers. spectra: of the target layers.
-    pairs: per output, which source layer meets which target layer. target_norm: of each.
+    packed, for `multiply_add`. pairs: per output, which source layer meets which target layer.
+    target_norm: of each target layer.
     """
 
     frame: Frame
@@ -145,7 +159,7 @@ def moment_products(
     def layers(h: Float64s, known: Bools) -> Float64s:
         return np.stack([_evaluate(f, h, known, unit) for f in source_names])
 
-    spectra = frame.target_spectra(stack, workers)
+    spectra = fourier.pack(frame.arrays, frame.target_spectra(stack, workers))
     return Products(frame, layers, spectra, tuple(pairs), norm(stack))
 
 
@@ -161,17 +175,18 @@ class Kernel:
 
 
 @lru_cache(maxsize=64)
-def _split(psi: str, low: float, high: float, g0: float, g1: float, tolerance: float) -> Separated:
+def _split(
+    psi: str, linear: float, low: float, high: float, g0: float, g1: float, tolerance: float
+) -> Separated:
     width = high - low
     half_width = max(width - g0, width + g1)
     expansion = expand(psi, half_width, 0.4 * tolerance)
-    return separate(expansion, (low, high), (low, high), (g0, g1), 0.6 * tolerance)
+    return separate(expansion, (low, high), (low, high), (g0, g1), 0.6 * tolerance, linear)
 
 
 def kernel_products(
     frame: Frame,
-    psi: str,
-    powers: tuple[float, float],
+    plan: Smooth,
     log_range: tuple[float, float],
     g_range: tuple[float, float],
     tolerance: float,
@@ -182,36 +197,54 @@ def kernel_products(
     """Return the products for a kernel. log_range: of ln h over both maps."""
     centre = 0.5 * (log_range[0] + log_range[1])
     low, high = log_range[0] - centre, log_range[1] - centre
-    separated = _split(psi, low, high, g_range[0], g_range[1], tolerance)
-    alpha, beta = powers
+    separated = _split(plan.psi, plan.linear, low, high, g_range[0], g_range[1], tolerance)
     nodes, rank = separated.target.shape[:2]
 
     def expand_layers(h: Float64s, known: Bools, rows: Float64s, power: float) -> Float64s:
-        flat = h[known]
-        waves = separated.waves(np.log(flat) - centre)
-        out = np.zeros((rows.shape[0], *h.shape))
-        out[:, known] = (rows @ waves) * flat**power
-        return out
+        where = np.flatnonzero(known)
+        flat = h.reshape(-1)[where]
+        out = np.zeros((rows.shape[0], h.size))
+        out[:, where] = (rows @ separated.waves(np.log(flat) - centre)) * flat**power
+        return out.reshape(-1, *h.shape)
 
     def layers(h: Float64s, known: Bools) -> Float64s:
-        return expand_layers(h, known, separated.source, alpha)
+        return expand_layers(h, known, separated.source, plan.alpha)
 
     spectra, norms = [], []
     for m in range(nodes):
-        stack = expand_layers(height_t, known_t, separated.target[m], beta)
-        spectra.append(frame.target_spectra(stack, workers))
+        stack = expand_layers(height_t, known_t, separated.target[m], plan.beta)
+        spectra.append(fourier.pack(frame.arrays, frame.target_spectra(stack, workers)))
         norms.append(norm(stack))
     pairs = tuple(tuple((p, m * rank + p) for p in range(rank)) for m in range(nodes))
     W = frame.arrays.xp.concatenate(spectra)
     return Kernel(Products(frame, layers, W, pairs, np.concatenate(norms)), separated)
 
 
-def chebyshev_sum(values: Array, position: Array) -> Array:
-    """Return `sum_m T_m(position) values[m]` by Clenshaw's recurrence; position in [-1, 1]."""
+def _clenshaw(values: Array, position: Array) -> Array:
     b1, b2 = 0.0 * position, 0.0 * position
     for m in range(values.shape[0] - 1, 0, -1):
         b1, b2 = 2.0 * position * b1 - b2 + values[m], b1
     return position * b1 - b2 + values[0]
+
+
+@numba.njit(cache=True, nogil=True)
+def _clenshaw_compiled(values: Array, position: Array, out: Array) -> None:  # pragma: no cover
+    for i in range(position.shape[0]):
+        for j in range(position.shape[1]):
+            x = position[i, j]
+            b1, b2 = 0.0, 0.0
+            for m in range(values.shape[0] - 1, 0, -1):
+                b1, b2 = 2.0 * x * b1 - b2 + values[m, i, j], b1
+            out[i, j] = x * b1 - b2 + values[0, i, j]
+
+
+def chebyshev_sum(arrays: Arrays, values: Array, position: Array) -> Array:
+    """Return `sum_m T_m(position) values[m]` by Clenshaw's recurrence; position in [-1, 1]."""
+    if arrays.name != "numpy":
+        return _clenshaw(values, position)
+    out = np.empty(position.shape, np.float64)
+    _clenshaw_compiled(values, position, out)
+    return out
 
 
 # Classes ------------------------------------------------------------------------------------------
@@ -269,7 +302,7 @@ class Classes:
     ) -> Array:
         """Return `sum_ij weigh((j - i + shift) step) U_i V_j` at every pose, (Sx, Sy)."""
         xp, count = self.frame.arrays.xp, self.steps.count
-        j = np.arange(count)
+        j = np.arange(count, dtype=np.float64)
         total = xp.zeros(U.shape[1:], U.dtype)
         table = weigh((j[None, :] - j[:, None] + shift) * self.steps.step)
         factor = xp.asarray(table.astype(self.frame.dtype))

@@ -94,8 +94,7 @@ def _kernel(
         if span not in prepared.kernels:
             prepared.kernels[span] = roads.kernel_products(
                 prepared.frame,
-                plan.psi,
-                (plan.alpha, plan.beta),
+                plan,
                 (float(np.log(prepared.height_range[0])), float(np.log(prepared.height_range[1]))),
                 span,
                 prepared.tolerance,
@@ -124,7 +123,7 @@ def _kernel(
     def evaluate(A: Any, B: Any) -> Array:
         if constant:
             return outputs[0].astype(np.float64) / scale(A, B)
-        return roads.chebyshev_sum(outputs, position(A, B)) / scale(A, B)
+        return roads.chebyshev_sum(prepared.frame.arrays, outputs, position(A, B)) / scale(A, B)
 
     def error(A: Any, B: Any, values: Mapping[str, Array]) -> Any:
         # sum a^alpha b^beta is n, sum a, or at most sqrt(sum a sum b)
@@ -160,7 +159,7 @@ def _over_classes(
     U, norms = classes.source(h, known, workers, weighted=weighted)
     low, high = _span(g, poses.counted, step)
     first, last = round(low / step), round(high / step)
-    total = frame.arrays.xp.zeros(frame.out_shape, np.float64)
+    total = frame.arrays.xp.zeros(poses.n.shape, np.float64)
     position = g / step
     reach = (classes.steps.count + max(abs(first), abs(last))) * step
     largest = float(np.max(np.abs(weigh(np.linspace(-reach, reach, 201)))))

@@ -95,16 +95,17 @@ class Moments:
 
 @dataclass(frozen=True, eq=False)
 class Smooth:
-    """Moments and `kernel = sum P^alpha Q^beta psi(ln(Q / P))` with psi even and smooth.
+    """Moments a and b, and `kernel = sum P^alpha Q^beta (psi(s) + linear s)`, s = ln(Q / P).
 
-    psi is a key of `matching.expansion.PSI`; its Fourier expansion makes products of it.
+    psi is even and smooth, a key of `matching.expansion.PSI`; its Fourier expansion makes products
+    of it.
     """
 
     psi: str
     alpha: float
     beta: float
-    terms: Mapping[str, tuple[Term, ...]]
     combine: Combine
+    linear: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

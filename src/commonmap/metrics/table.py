@@ -96,25 +96,15 @@ def _metric(
     )
 
 
-def _smooth(
-    psi: str, alpha: float, beta: float, terms: dict[str, tuple[c.Term, ...]], combine: c.Combine
-) -> Smooth:
-    return Smooth(psi, alpha, beta, terms, combine)
-
-
-def _taneja(s: Sums) -> Any:
+def _kernel(s: Sums) -> Any:
     return s["kernel"]
 
 
-_TANEJA = _smooth("cosh ln cosh", 0.5, 0.5, {}, _taneja)
-_TOPSOE = _smooth(
-    "cosh ln cosh", 0.5, 0.5, c.JEFFREYS_TERMS, lambda s: 0.5 * c.jeffreys(s) - 2.0 * s["kernel"]
-)
-_HALF_TOPSOE = _smooth(
-    "cosh ln cosh", 0.5, 0.5, c.JEFFREYS_TERMS, lambda s: 0.25 * c.jeffreys(s) - s["kernel"]
-)
-_K = _smooth("ln cosh", 1.0, 0.0, c.KL_TERMS, lambda s: 0.5 * c.kl(s) - s["kernel"])
-_SUMS: dict[str, tuple[c.Term, ...]] = {**c.A_SUM, **c.B_SUM}
+# K: p ln(2p/(p+q)) = -p ln((1 + e^s)/2) = -p (s/2 + ln cosh(s/2))
+_K = Smooth("ln cosh", 1.0, 0.0, lambda s: -s["kernel"], linear=0.5)
+_TOPSOE = Smooth("topsoe", 0.5, 0.5, _kernel)
+_HALF_TOPSOE = Smooth("topsoe", 0.5, 0.5, lambda s: 0.5 * s["kernel"])
+_TANEJA = Smooth("cosh ln cosh", 0.5, 0.5, _kernel)
 
 
 def _l1(s: Sums) -> Any:
@@ -164,17 +154,17 @@ _ROWS = (
     _metric("neyman", "Neyman chi2", "sum (P-Q)^2/P", f.neyman,
             Moments(c.CHI2_TERMS, c.neyman), INF, family=CHI2, symmetric=False),
     _metric("squared-chi2", "Squared chi2", "sum (P-Q)^2/(P+Q)", f.squared_chi2,
-            _smooth("sech", 0.5, 0.5, _SUMS, lambda s: s.P + s.Q - 2.0 * s["kernel"]),
+            Smooth("sech", 0.5, 0.5, lambda s: s.P + s.Q - 2.0 * s["kernel"]),
             2.0, family=CHI2),
     _metric("symmetric-chi2", "Probabilistic symmetric chi2", "2 sum (P-Q)^2/(P+Q)",
             f.symmetric_chi2,
-            _smooth("sech", 0.5, 0.5, _SUMS, lambda s: 2.0 * (s.P + s.Q) - 4.0 * s["kernel"]),
+            Smooth("sech", 0.5, 0.5, lambda s: 2.0 * (s.P + s.Q) - 4.0 * s["kernel"]),
             4.0, family=CHI2),
     _metric("divergence", "Divergence", "2 sum (P-Q)^2/(P+Q)^2", f.divergence,
-            _smooth("sech^2", 0.0, 0.0, _SUMS, lambda s: 2.0 * (s.n - s["kernel"])),
+            Smooth("sech^2", 0.0, 0.0, lambda s: 2.0 * (s.n - s["kernel"])),
             INF, family=CHI2),
     _metric("clark", "Clark", "sqrt(sum ((P-Q)/(P+Q))^2)", f.clark,
-            _smooth("sech^2", 0.0, 0.0, _SUMS, lambda s: c.root(s.n - s["kernel"])),
+            Smooth("sech^2", 0.0, 0.0, lambda s: c.root(s.n - s["kernel"])),
             INF, family=CHI2),
     _metric("additive-chi2", "Additive symmetric chi2", "sum (P-Q)^2 (P+Q)/(PQ)",
             f.additive_chi2, Moments(c.CHI2_TERMS, c.additive_chi2), INF, family=CHI2),
@@ -195,7 +185,7 @@ _ROWS = (
     _metric("inner-product", "Inner product", "sum PQ", f.inner_product,
             Moments(c.SQUARE_TERMS, c.pq), 0.0, family=INNER, best=1.0, maximise=True),
     _metric("harmonic-mean", "Harmonic mean", "2 sum PQ/(P+Q)", f.harmonic_mean,
-            _smooth("sech", 0.5, 0.5, _SUMS, lambda s: s["kernel"]), 0.0, family=INNER,
+            Smooth("sech", 0.5, 0.5, _kernel), 0.0, family=INNER,
             best=1.0, maximise=True),
     _metric("cosine", "Cosine", "sum PQ / sqrt(sum P^2 sum Q^2)", f.cosine,
             Moments(c.SQUARE_TERMS, lambda s: c.divide(c.pq(s), c.root(c.pp(s) * c.qq(s)))),
