@@ -44,7 +44,7 @@ def write_geotiff(
     import rasterio
     from rasterio.errors import RasterioError
     from rasterio.io import MemoryFile
-    from rasterio.transform import from_origin
+    from rasterio.transform import Affine
 
     nx, ny = shape
     with writing(path) as part:
@@ -59,7 +59,7 @@ def write_geotiff(
                     dtype="float32",
                     nodata=math.nan,
                     crs=_raster_crs(crs, path),
-                    transform=from_origin(corner[0], corner[1] + ny * cell, cell, cell),
+                    transform=Affine(cell, 0.0, corner[0], 0.0, -cell, corner[1] + ny * cell),
                     compress="deflate",
                     predictor=3,
                     interleave="band",
@@ -120,7 +120,7 @@ def _raster_crs(crs: str | None, path: PathLike) -> Any:
     from rasterio.errors import CRSError
 
     try:
-        return CRS.from_wkt(crs)
+        return CRS.from_user_input(crs)
     except CRSError as error:
         log.warning("%s: written without its CRS, which GDAL does not know (%s)", path, error)
         return None

@@ -169,8 +169,9 @@ def _find_layout(file: BinaryIO, path: Path) -> Layout:
             return _layout(start, delimiter, words, names, comment_names, count, crs, path)
         if line.lower().startswith("ncols"):
             raise InputError(f"{path} is an ESRI grid, not a list of points")
-        if delimiter == ";" and "," in words[0] and _is_number(words[0].replace(",", ".")):
-            raise InputError(f"{path} has decimal commas ({words[0]}); write decimal points")
+        first = line.split(";" if delimiter == ";" else None)[0]
+        if first.count(",") == 1 and all(map(_is_number, first.replace(",", " ").split())):
+            raise InputError(f"{path} has decimal commas ({first}); write decimal points")
         names = words
     raise EmptyMapError(f"{path} holds no points")
 
@@ -205,7 +206,7 @@ def _layout(
 def _delimiter(line: str) -> str | None:
     """Return the delimiter of a line, None for white space."""
     for candidate in (";", "\t", ","):
-        if candidate in line and len(_split(line, candidate)) >= 3:
+        if candidate in line and len(_split(line, candidate)) >= 2:
             return candidate
     return None
 
