@@ -93,9 +93,9 @@ def resample(leaves: Leaves, T_target_source: ArrayLike, resolution: float) -> L
     where it holds the centre of an occupied voxel of the source (so that nothing thin vanishes);
     else free where at least half of it is known; else unknown. Its log-odds are the mean over the
     known part by volume, but of the sign of its class: at least the occupied (at most the free)
-    log-odds times the share of volume they fill. The identity at the same resolution changes nothing, and so
-    do shifts by whole voxels. Volume is measured at sample points, 3 along an edge of the smaller
-    of the two voxels.
+    log-odds times the share of volume they fill. The identity at the same resolution changes
+    nothing, and so do shifts by whole voxels. Volume is measured at sample points, 3 along an edge
+    of the smaller of the two voxels.
 
     Bounds, r the edge of the larger voxel: every occupied source voxel has an occupied target voxel
     whose centre is at most sqrt(3)/2 r from its own; every occupied target voxel overlaps an
