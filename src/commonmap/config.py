@@ -91,13 +91,14 @@ class MergeConfig:
 
     resolution: edge of a voxel of the common octree; None takes the target's where it is an
         octree, else the one of the match.
-    mode: how two opinions on one voxel are joined; "add" adds their log-odds.
+    mode: how two opinions on one voxel are joined: "add" adds their log-odds, "keep-target" lets
+        what the target knows stand, "occupied-wins" takes the larger.
     step_height: what rises less than this above the local ground is no obstacle, metres.
     robot_height: what hangs higher than this above the local ground is no obstacle, metres.
     """
 
     resolution: float | None = None
-    mode: Literal["add"] = "add"
+    mode: Literal["add", "keep-target", "occupied-wins"] = "add"
     step_height: float = 0.15
     robot_height: float = 1.8
 

@@ -1,0 +1,180 @@
+"""Each job as one page, read from top to bottom: match, merge, run, demo.
+
+No file is opened here: maps come in, answers go out.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from commonmap.config import Config
+from commonmap.errors import InputError
+from commonmap.frames import apply, check_points, check_T, difference
+from commonmap.mapping.points import points_of
+from commonmap.matching.match import match
+from commonmap.merging.products import (
+    CommonMap,
+    Map,
+    choose_octree_origin,
+    choose_resolution,
+    merge_clouds,
+    merge_heights,
+    merge_octrees,
+    navigation_map,
+)
+from commonmap.metrics.table import find_metric
+from commonmap.types import Cloud, Float64s, Leaves, Match, Progress, no_progress
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What `run` returns. common: the merged map, or None where the match was refused."""
+
+    match: Match
+    common: CommonMap | None
+
+
+@dataclass(frozen=True, eq=False)
+class Demo:
+    """A simulated job and how far its answer is from the truth.
+
+    T_target_source: the truth, (4, 4). metres: distance between answer and truth at the middle of
+    the draft. radians: angle between them. Both None where the match was refused.
+    """
+
+    target: Cloud
+    source: Cloud
+    T_target_source: Float64s
+    result: Result
+    metres: float | None
+    radians: float | None
+
+
+def match_maps(
+    target: Map | ArrayLike,
+    source: Map | ArrayLike,
+    *,
+    config: Config | None = None,
+    progress: Progress = no_progress,
+) -> Match:
+    """Return where the source lies in the target's frame, or why that cannot be said.
+
+    target, source: a `Cloud`, the `Leaves` of an octree, or an (N, 3) array of metres, z up.
+    """
+    config = config or Config()
+    find_metric(config.search.metric)
+    start = time.perf_counter()
+    found = match(as_map(target), as_map(source), config=config, progress=progress)
+    seconds = time.perf_counter() - start
+    return replace(found, timings={**found.timings, "match": seconds})
+
+
+def merge_maps(
+    target: Map | ArrayLike,
+    source: Map | ArrayLike,
+    T_target_source: ArrayLike,
+    *,
+    config: Config | None = None,
+    progress: Progress = no_progress,
+) -> CommonMap:
+    """Return the common map of two maps whose relative pose is known, in the target's frame."""
+    config = config or Config()
+    target, source = as_map(target), as_map(source)
+    T = check_T(T_target_source, "T_target_source")
+
+    # 1. points of both in the target's frame: (N, 3) and (M, 3)
+    progress("points of both maps")
+    xyz_target = points_of(target, "target")
+    xyz_source = apply(T, points_of(source, "source"))
+
+    # 2. the size of a voxel, and the origin of the octree where coordinates are large: (3,)
+    resolution = choose_resolution(target, source, config)
+    octree_origin = choose_octree_origin(np.concatenate([xyz_target, xyz_source]), resolution)
+
+    # 3. octree: occupied, free and unknown kept apart, and who saw what
+    progress("common octree")
+    tree = merge_octrees(
+        target, source, T, resolution=resolution, octree_origin=octree_origin,
+        mode=config.merge.mode,
+    )  # fmt: skip
+
+    # 4. cloud with provenance: (N + M, 3)
+    progress("common cloud")
+    cloud = merge_clouds(target, source, T, voxel=resolution)
+
+    # 5. height map of the plan: layers (nx, ny)
+    progress("common height map")
+    heights = merge_heights(xyz_target, xyz_source, cell=resolution, config=config.merge)
+
+    # 6. where a robot may drive: (nx, ny) of free, occupied, unknown
+    progress("navigation map")
+    navigation = navigation_map(
+        heights, leaves=tree.leaves, octree_origin=octree_origin, config=config.merge
+    )
+    seen_by = tree.provenance.astype(np.uint8)
+    return CommonMap(cloud, tree.leaves, seen_by, tree.conflict, octree_origin, heights, navigation)
+
+
+def run(
+    target: Map | ArrayLike,
+    source: Map | ArrayLike,
+    *,
+    config: Config | None = None,
+    progress: Progress = no_progress,
+) -> Result:
+    """Return the match of two maps and, where it is accepted, the common map."""
+    # 1. the pose, and whether to believe it
+    found = match_maps(target, source, config=config, progress=progress)
+    if not found.accepted or found.T_target_source is None:
+        return Result(found, None)
+
+    # 2. the common map in the target's frame
+    start = time.perf_counter()
+    common = merge_maps(target, source, found.T_target_source, config=config, progress=progress)
+    seconds = time.perf_counter() - start
+    return Result(replace(found, timings={**found.timings, "merge": seconds}), common)
+
+
+def demo(
+    *,
+    rng: np.random.Generator,
+    scene: str = "paper",
+    drift: float = 0.003,
+    config: Config | None = None,
+    progress: Progress = no_progress,
+) -> Demo:
+    """Return two simulated robots' maps of one place, the job run on them, and its error.
+
+    scene: a name of `commonmap.sim.worlds.WORLDS`. drift: error of the robots' poses as a share of
+    the way they went; the maps are made with the true poses and this drift.
+    """
+    from commonmap.sim.pairs import simulate_pair
+
+    # 1. a drone over the place and a ground robot in it: two clouds, each in its own frame
+    progress("simulate two robots")
+    pair = simulate_pair(scene, rng=rng, drift=drift)
+
+    # 2. the job; it is not told the truth
+    result = run(pair.target, pair.source, config=config, progress=progress)
+
+    # 3. how far from the truth, in the middle of the draft
+    metres = radians = None
+    if result.match.T_target_source is not None:
+        centre = pair.source.xyz.mean(axis=0)
+        metres, radians = difference(result.match.T_target_source, pair.T_target_source, centre)
+    return Demo(pair.target, pair.source, pair.T_target_source, result, metres, radians)
+
+
+def as_map(map_: Map | ArrayLike) -> Map:
+    """Return a cloud or an octree as it is, an (N, 3) array as a cloud."""
+    if isinstance(map_, Cloud | Leaves):
+        return map_
+    values: Any = np.asarray(map_)
+    if values.dtype == object:
+        raise InputError("a map is a Cloud, Leaves or an (N, 3) array of x, y, z in metres")
+    return Cloud(xyz=check_points(values, "a map"))
