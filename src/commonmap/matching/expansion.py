@@ -128,6 +128,7 @@ class Separated:
 
     `u_p(x) = source[p] . waves(x)`, `v_mp(y) = target[m, p] . waves(y)`,
     `waves(x) = [cos(omega x), sin(omega x), x]`, `g' = (g - middle) / half` in [-1, 1].
+    pairs: per m, the p that matter; the others are dropped, and counted in the error.
     error: a bound for x, y, g in their ranges.
     """
 
@@ -137,6 +138,7 @@ class Separated:
     middle: float
     half: float
     error: float
+    pairs: tuple[tuple[int, ...], ...]
 
     def waves(self, x: Float64s) -> Float64s:
         """Return (2 K + 1, ...) cosines, then sines, of omega times x, then x."""
@@ -163,40 +165,52 @@ def interpolation_error(expansion: Expansion, half: float, nodes: int) -> float:
     return float(np.abs(expansion.alpha[1:]) @ powers)
 
 
-def _bound_residual(
-    residual: Float64s, omega: Float64s, x: Float64s, z: Float64s, orders: int = 8
-) -> float:
-    """Bound `|waves(x) . residual . waves(z)|` over the ranges that the grids x and z span.
+ORDERS = 8
+"""Derivatives that the bounds below look at before they stop at the sum of the coefficients."""
 
-    A function exceeds its grid values by at most half a step times its slope, in x and in z; the
-    slopes are bounded the same way, and those of order `orders` by the sum of the coefficients.
+
+def _derivative(omega: Float64s, grid: Float64s, d: int) -> Float64s:
+    """Return the d-th derivatives of the waves on a grid, (2 K + 1, N)."""
+    angle = np.multiply.outer(omega, grid) + 0.5 * np.pi * d
+    scale = (omega**d)[:, None]
+    straight = grid if d == 0 else np.full_like(grid, float(d == 1))
+    return np.concatenate([scale * np.cos(angle), scale * np.sin(angle), straight[None]])
+
+
+def _largest(omega: Float64s, grid: Float64s, d: int) -> Float64s:
+    """Return bounds of the d-th derivatives of the waves over the grid's range, (2 K + 1,)."""
+    straight = float(np.max(np.abs(grid))) if d == 0 else float(d == 1)
+    return np.concatenate([omega**d, omega**d, [straight]])
+
+
+def _bound_rows(rows: Float64s, omega: Float64s, grid: Float64s) -> Float64s:
+    """Bound `|rows . waves|` over the range that the grid spans, one number a row.
+
+    A function exceeds its grid values by at most half a step times its slope, and so on.
     """
-    wave = np.concatenate([omega, omega])
-    turn = np.concatenate([np.zeros(omega.size), np.full(omega.size, -0.5 * np.pi)])
+    half_step = 0.5 * (grid[1] - grid[0])
+    bound: Float64s = np.abs(rows) @ _largest(omega, grid, ORDERS)
+    for d in range(ORDERS - 1, -1, -1):
+        bound = np.max(np.abs(rows @ _derivative(omega, grid, d)), axis=1) + half_step * bound
+    return bound
+
+
+def _bound_residual(residual: Float64s, omega: Float64s, x: Float64s, z: Float64s) -> float:
+    """Bound `|waves(x) . residual . waves(z)|` over the ranges of both grids, in the same way."""
     half_x, half_z = 0.5 * (x[1] - x[0]), 0.5 * (z[1] - z[0])
-
-    def derivative(grid: Float64s, d: int) -> Float64s:
-        angle = np.multiply.outer(wave, grid) + turn[:, None]
-        straight = grid if d == 0 else np.full_like(grid, float(d == 1))
-        waves = (wave**d)[:, None] * np.cos(angle + 0.5 * np.pi * d)
-        return np.concatenate([waves, straight[None]])
-
-    def largest(grid: Float64s, d: int) -> Float64s:
-        straight = float(np.max(np.abs(grid))) if d == 0 else float(d == 1)
-        return np.append(wave**d, straight)
-
-    on_x = [derivative(x, d) for d in range(orders)]
-    on_z = [derivative(z, d) for d in range(orders)]
+    on_x = [_derivative(omega, x, d) for d in range(ORDERS)]
+    on_z = [_derivative(omega, z, d) for d in range(ORDERS)]
+    size = np.abs(residual)
     bound = {
-        (i, orders - i): float(largest(x, i) @ np.abs(residual) @ largest(z, orders - i))
-        for i in range(orders + 1)
+        i: float(_largest(omega, x, i) @ size @ _largest(omega, z, ORDERS - i))
+        for i in range(ORDERS + 1)
     }
-    for order in range(orders - 1, -1, -1):
-        for i in range(order + 1):
-            j = order - i
-            seen = float(np.max(np.abs(on_x[i].T @ residual @ on_z[j])))
-            bound[i, j] = seen + half_x * bound[i + 1, j] + half_z * bound[i, j + 1]
-    return bound[0, 0]
+    for order in range(ORDERS - 1, -1, -1):
+        seen = [
+            float(np.max(np.abs(on_x[i].T @ residual @ on_z[order - i]))) for i in range(order + 1)
+        ]
+        bound = {i: seen[i] + half_x * bound[i + 1] + half_z * bound[i] for i in range(order + 1)}
+    return bound[0]
 
 
 @lru_cache(maxsize=64)
@@ -216,7 +230,7 @@ def separate(
     alpha, omega = expansion.alpha, expansion.omega
     middle, half = 0.5 * (g_range[0] + g_range[1]), 0.5 * (g_range[1] - g_range[0])
     nodes = 2 if half > 0.0 and linear else 1
-    while half > 0.0 and interpolation_error(expansion, half, nodes) > 0.5 * tolerance:
+    while half > 0.0 and interpolation_error(expansion, half, nodes) > 0.3 * tolerance:
         nodes += 1
         if nodes > MAX_NODES:
             raise InputError(
@@ -237,10 +251,10 @@ def separate(
         source = (exact @ waves_z @ (right[:rank].T / size[:rank])).T  # u_p in the waves of x
         over_z = left[:, :rank].T @ waves_x.T @ exact  # v_p in the waves of z
         residual = exact - source.T @ over_z
-        if lebesgue * float(np.max(np.abs(waves_x.T @ residual @ waves_z))) > 0.5 * tolerance:
+        if lebesgue * float(np.max(np.abs(waves_x.T @ residual @ waves_z))) > 0.4 * tolerance:
             continue
         lost = lebesgue * _bound_residual(residual, omega, x, z)
-        if lost <= 0.5 * tolerance:
+        if lost <= 0.4 * tolerance:
             break
     else:
         source, over_z, lost = np.eye(2 * omega.size + 1), exact, 0.0
@@ -255,4 +269,18 @@ def separate(
     to_chebyshev = np.cos(np.multiply.outer(np.arange(nodes), theta)) * (2.0 / nodes)
     to_chebyshev[0] *= 0.5
     target = np.einsum("mj,jpk->mpk", to_chebyshev, at_nodes)
-    return Separated(omega, source, target, middle, half, expansion.error + between + lost)
+
+    # products that contribute next to nothing: |T_m| <= 1, so at most max |u_p| max |v_mp| each
+    y = np.linspace(*y_range, 501)
+    flat = target.reshape(-1, target.shape[-1])
+    reach = _bound_rows(flat, omega, y).reshape(nodes, rank) * _bound_rows(source, omega, x)
+    order = np.argsort(reach, axis=None, kind="stable")
+    n_dropped = int(np.searchsorted(np.cumsum(reach.ravel()[order]), 0.3 * tolerance))
+    matter = np.ones(reach.size, np.bool_)
+    matter[order[:n_dropped]] = False
+    little = float(reach.ravel()[order[:n_dropped]].sum())
+    pairs = tuple(tuple(int(p) for p in np.flatnonzero(row)) for row in matter.reshape(reach.shape))
+    kept = max((m + 1 for m, some in enumerate(pairs) if some), default=1)
+    target, pairs = target[:kept], pairs[:kept]
+    error = expansion.error + between + lost + little
+    return Separated(omega, source, target, middle, half, error, pairs)

@@ -184,6 +184,30 @@ def _split(
     return separate(expansion, (low, high), (low, high), (g0, g1), 0.6 * tolerance, linear)
 
 
+@numba.njit(cache=True, nogil=True)
+def _fill_waves(
+    h: Array, known: Array, rows: Array, step: float, centre: float, power: float, out: Array
+) -> None:  # pragma: no cover
+    """out[r] = rows[r] . [cos(k step x), sin(k step x), x] h^power, x = ln h - centre."""
+    K = (rows.shape[1] - 1) // 2
+    for i in range(h.shape[0]):
+        for j in range(h.shape[1]):
+            if not known[i, j]:
+                continue
+            x = np.log(h[i, j]) - centre
+            scale = h[i, j] ** power
+            c1, s1 = np.cos(step * x), np.sin(step * x)
+            c, s = 1.0, 0.0
+            for r in range(rows.shape[0]):
+                out[r, i, j] = rows[r, 2 * K] * x
+            for k in range(K):
+                for r in range(rows.shape[0]):
+                    out[r, i, j] += rows[r, k] * c + rows[r, K + k] * s
+                c, s = c * c1 - s * s1, s * c1 + c * s1
+            for r in range(rows.shape[0]):
+                out[r, i, j] *= scale
+
+
 def kernel_products(
     frame: Frame,
     plan: Smooth,
@@ -198,26 +222,27 @@ def kernel_products(
     centre = 0.5 * (log_range[0] + log_range[1])
     low, high = log_range[0] - centre, log_range[1] - centre
     separated = _split(plan.psi, plan.linear, low, high, g_range[0], g_range[1], tolerance)
-    nodes, rank = separated.target.shape[:2]
 
     def expand_layers(h: Float64s, known: Bools, rows: Float64s, power: float) -> Float64s:
-        where = np.flatnonzero(known)
-        flat = h.reshape(-1)[where]
-        out = np.zeros((rows.shape[0], h.size))
-        out[:, where] = (rows @ separated.waves(np.log(flat) - centre)) * flat**power
-        return out.reshape(-1, *h.shape)
+        out = np.zeros((rows.shape[0], *h.shape))
+        _fill_waves(h, known, rows, separated.omega[1], centre, power, out)
+        return out
 
     def layers(h: Float64s, known: Bools) -> Float64s:
         return expand_layers(h, known, separated.source, plan.alpha)
 
     spectra, norms = [], []
-    for m in range(nodes):
-        stack = expand_layers(height_t, known_t, separated.target[m], plan.beta)
+    pairs: list[tuple[tuple[int, int], ...]] = []
+    for m, some in enumerate(separated.pairs):
+        first = sum(len(earlier) for earlier in pairs)
+        pairs.append(tuple((p, first + k) for k, p in enumerate(some)))
+        if not some:
+            continue
+        stack = expand_layers(height_t, known_t, separated.target[m, list(some)], plan.beta)
         spectra.append(fourier.pack(frame.arrays, frame.target_spectra(stack, workers)))
         norms.append(norm(stack))
-    pairs = tuple(tuple((p, m * rank + p) for p in range(rank)) for m in range(nodes))
     W = frame.arrays.xp.concatenate(spectra)
-    return Kernel(Products(frame, layers, W, pairs, np.concatenate(norms)), separated)
+    return Kernel(Products(frame, layers, W, tuple(pairs), np.concatenate(norms)), separated)
 
 
 def _clenshaw(values: Array, position: Array) -> Array:
