@@ -168,18 +168,53 @@ def test_a_horizontal_crs_in_feet_alone_speaks_for_z_too(tmp_path: Path) -> None
 @pytest.mark.parametrize(("code", "factor"), [(9001, 1.0), (9002, 0.3048), (9003, US_FOOT)])
 def test_the_vertical_unit_of_geotiff_keys(tmp_path: Path, code: int, factor: float) -> None:
     path = write_with_laspy(tmp_path / "map.las", version="1.2", point_format=1, crs="EPSG:32612")
+    with_geo_keys(path, (4099, code))
+    np.testing.assert_allclose(read_cloud(path).xyz[0, 2], 2280.03 * factor, rtol=1e-9)
+    np.testing.assert_allclose(read_cloud(path).xyz[0, 0], 470600.01, rtol=1e-12)
+
+
+def with_geo_keys(path: Path, *entries: tuple[int, int]) -> None:
+    """Add keys (id, value) to the GeoTIFF directory of a LAS file."""
+    from laspy.vlrs.known import GeoKeyEntryStruct
+
     with laspy.open(path) as reader:
         data = reader.read()
     keys = data.header.vlrs.get("GeoKeyDirectoryVlr")[0]
-    from laspy.vlrs.known import GeoKeyEntryStruct
-
-    entry = GeoKeyEntryStruct()
-    entry.id, entry.tiff_tag_location, entry.count, entry.value_offset = 4099, 0, 1, code
-    keys.geo_keys.append(entry)
+    new = {key.id: key.value_offset for key in keys.geo_keys} | dict(entries)
+    keys.geo_keys = []
+    for name, value in sorted(new.items()):
+        entry = GeoKeyEntryStruct()
+        entry.id, entry.tiff_tag_location, entry.count, entry.value_offset = name, 0, 1, value
+        keys.geo_keys.append(entry)
     keys.geo_keys_header.number_of_keys = len(keys.geo_keys)
     data.write(path)
-    np.testing.assert_allclose(read_cloud(path).xyz[0, 2], 2280.03 * factor, rtol=1e-9)
-    np.testing.assert_allclose(read_cloud(path).xyz[0, 0], 470600.01, rtol=1e-12)
+
+
+def test_a_projection_without_a_code_is_not_taken_for_degrees(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = write_with_laspy(tmp_path / "map.las", version="1.2", point_format=1, crs="EPSG:32612")
+    with_geo_keys(path, (1024, 1), (2048, 4269), (3072, 32767), (3076, 9002))
+    with caplog.at_level(logging.WARNING, logger="commonmap"):
+        cloud = read_cloud(path)
+    assert cloud.crs is None
+    assert "its projection has no code" in caplog.text
+    feet = np.array([470600.01, 3810200.02, 2280.03])
+    np.testing.assert_allclose(cloud.xyz[0], feet * 0.3048, rtol=1e-12)
+
+
+def test_a_foot_crs_bound_to_another_datum_becomes_metric(tmp_path: Path) -> None:
+    from commonmap.io.units import to_metres
+
+    wkt = CRS.from_proj4(
+        "+proj=lcc +lat_0=40 +lon_0=-74 +lat_1=41 +lat_2=40.6 +x_0=300000 +y_0=0 +datum=NAD27 "
+        "+towgs84=-8,160,176 +units=us-ft +no_defs"
+    )
+    assert wkt.is_bound
+    xyz, crs = to_metres(np.array([[1000.0, 2000.0, 30.0]]), wkt.to_wkt(), tmp_path)
+    np.testing.assert_allclose(xyz, np.array([[1000.0, 2000.0, 30.0]]) * US_FOOT, rtol=1e-12)
+    assert crs is not None
+    assert {axis.unit_name for axis in CRS.from_wkt(crs).axis_info} == {"metre"}
 
 
 @pytest.mark.parametrize(

@@ -69,7 +69,7 @@ def test_real_points_go_round(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["air-ground/uas.laz", "airborne/CSite2_orig-utm.pcd"])
-@pytest.mark.parametrize("share", [0.0001, 0.05, 0.5, 0.99, 0.999])
+@pytest.mark.parametrize("share", [0.0001, 0.05, 0.5, 0.9, 0.99])
 def test_real_files_cut_short(tmp_path: Path, name: str, share: float) -> None:
     data = (DATA / name).read_bytes()
     path = tmp_path / Path(name).name

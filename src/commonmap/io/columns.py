@@ -69,9 +69,11 @@ def cloud_of(
     path: Path,
     *,
     crs: str | None = None,
-    vertical_factor: float | None = None,
+    units: tuple[float | None, float | None] = (None, None),
 ) -> Cloud:
     """Return the cloud of columns named as in `ALIASES`, each (N,).
+
+    units: metres per unit of x and y, and of z, where the file states them beside its CRS.
 
     Points without finite coordinates are dropped and counted in the log. Raises `EmptyMapError`
     where none is left, `UnitsError` where the coordinates cannot be metres.
@@ -91,7 +93,7 @@ def cloud_of(
         )
         xyz = xyz[finite]
         columns = {name: column[finite] for name, column in columns.items()}
-    metric, crs = to_metres(xyz, crs, path, vertical_factor=vertical_factor)
+    metric, crs = to_metres(xyz, crs, path, units=units)
     check_plausible(metric, crs, path)
     return Cloud(
         xyz=metric,

@@ -47,7 +47,7 @@ def read_las(path: PathLike) -> Cloud:
         warnings.simplefilter("ignore")
         info = read_info(path, size)
         columns, crs = _read_columns(path, info)
-    return cloud_of(columns, path, crs=crs, vertical_factor=info.vertical_factor)
+    return cloud_of(columns, path, crs=crs, units=(info.keys.horizontal, info.keys.vertical))
 
 
 def las_version(path: Path) -> str:
@@ -96,7 +96,7 @@ def _read_columns(path: Path, info: LasInfo) -> tuple[dict[str, Column], str | N
     blocks: list[dict[str, Column]] = []
     withheld = noise = 0
     with open(path, "rb") as file, laspy.open(file, closefd=False) as reader:
-        crs = _crs(reader, path)
+        crs = _crs(reader, path, info)
         names = set(reader.header.point_format.dimension_names)
         wanted = [
             name
@@ -154,8 +154,12 @@ def _as_cloud_columns(columns: dict[str, Column]) -> dict[str, Column]:
     return columns
 
 
-def _crs(reader: Any, path: Path) -> str | None:
-    """Return the CRS of a LAS file as WKT, from its WKT record (EVLR too) or its GeoTIFF keys."""
+def _crs(reader: Any, path: Path, info: LasInfo) -> str | None:
+    """Return the CRS of a LAS file as WKT, from its WKT record (EVLR too) or its GeoTIFF keys.
+
+    Of a projection that the keys spell out without a code, laspy returns the geographic base: such
+    a file is in metres or feet, not in degrees, and its CRS is left out.
+    """
     from pyproj.exceptions import CRSError
 
     if reader.header.evlrs is None and reader.header.version.minor >= 4:
@@ -170,7 +174,12 @@ def _crs(reader: Any, path: Path) -> str | None:
         return None
     finally:
         quiet.setLevel(level)
-    return None if crs is None else str(crs.to_wkt())
+    if crs is None:
+        return None
+    if crs.is_geographic and info.keys.projected:
+        log.warning("%s: its projection has no code in the GeoTIFF keys and is left out", path)
+        return None
+    return str(crs.to_wkt())
 
 
 def _require_finite(cloud: Cloud, path: Path) -> None:

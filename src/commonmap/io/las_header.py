@@ -31,12 +31,22 @@ METRES_PER_UNIT = {9001: 1.0, 9002: 0.3048, 9003: 1200.0 / 3937.0}
 
 
 @dataclass(frozen=True)
+class GeoKeys:
+    """GeoTIFF keys that laspy does not read. projected: the model is a projection (key 1024), even
+    where its code is user-defined. horizontal, vertical: metres per unit (keys 3076 and 4099)."""
+
+    projected: bool = False
+    horizontal: float | None = None
+    vertical: float | None = None
+
+
+@dataclass(frozen=True)
 class LasInfo:
     """What the header says, once it agrees with the file.
 
     version: "1.4", say. point_format: 0 to 10. n_points: in the header, checked.
     compressed: LAZ. chunk_size: points per LAZ chunk, None where chunks vary.
-    vertical_factor: metres per unit of z where GeoTIFF keys name a vertical unit.
+    keys: what GeoTIFF keys say beside the code of a CRS.
     """
 
     version: str
@@ -46,7 +56,7 @@ class LasInfo:
     data_start: int
     compressed: bool
     chunk_size: int | None
-    vertical_factor: float | None
+    keys: GeoKeys
 
 
 def read_info(path: Path, size: int) -> LasInfo:
@@ -88,7 +98,7 @@ def _read_info(file: BinaryIO, path: Path, size: int) -> LasInfo:
         abs(offset) < 1e12 for offset in scales[3:]
     ):
         raise InputError(f"{path}: its header has scale and offset {scales}, which cannot be")
-    laszip, vertical = _walk_vlrs(file, path, header_bytes, data_start, n_vlrs)
+    laszip, keys = _walk_vlrs(file, path, header_bytes, data_start, n_vlrs)
     if n_evlrs:
         _check_evlrs(file, path, evlr_start, n_evlrs, size)
     if n_points == 0:
@@ -101,7 +111,7 @@ def _read_info(file: BinaryIO, path: Path, size: int) -> LasInfo:
         data_start=data_start,
         compressed=compressed,
         chunk_size=None,
-        vertical_factor=vertical,
+        keys=keys,
     )
     if not compressed:
         room = (size - data_start) // record_bytes
@@ -117,9 +127,9 @@ def _read_info(file: BinaryIO, path: Path, size: int) -> LasInfo:
 
 def _walk_vlrs(
     file: BinaryIO, path: Path, start: int, end: int, n_vlrs: int
-) -> tuple[bytes | None, float | None]:
-    """Return the LASzip record, and metres per vertical unit; raise where records overrun."""
-    laszip, vertical = None, None
+) -> tuple[bytes | None, GeoKeys]:
+    """Return the LASzip record and the GeoTIFF keys; raise where records overrun."""
+    laszip, keys = None, GeoKeys()
     position = start
     for i in range(n_vlrs):
         file.seek(position)
@@ -134,18 +144,20 @@ def _walk_vlrs(
         if user == b"laszip encoded" and record == 22204:
             laszip = file.read(length)
         elif user == b"LASF_Projection" and record == 34735:
-            vertical = _vertical_factor(file.read(length))
+            keys = _geo_keys(file.read(length))
         position += 54 + length
-    return laszip, vertical
+    return laszip, keys
 
 
-def _vertical_factor(keys: bytes) -> float | None:
-    """Return metres per unit of z from a GeoTIFF key directory (VerticalUnitsGeoKey, 4099)."""
-    shorts = struct.unpack(f"<{len(keys) // 2}H", keys[: len(keys) // 2 * 2])
-    for i in range(4, len(shorts) - 3, 4):
-        if shorts[i] == 4099 and shorts[i + 1] == 0:
-            return METRES_PER_UNIT.get(shorts[i + 3])
-    return None
+def _geo_keys(directory: bytes) -> GeoKeys:
+    """Return what a GeoTIFF key directory says: entries of key, place (0: here), count, value."""
+    shorts = struct.unpack(f"<{len(directory) // 2}H", directory[: len(directory) // 2 * 2])
+    here = {shorts[i]: shorts[i + 3] for i in range(4, len(shorts) - 3, 4) if shorts[i + 1] == 0}
+    return GeoKeys(
+        projected=here.get(1024) == 1,
+        horizontal=METRES_PER_UNIT.get(here.get(3076, 0)),
+        vertical=METRES_PER_UNIT.get(here.get(4099, 0)),
+    )
 
 
 def _check_evlrs(file: BinaryIO, path: Path, start: int, n_evlrs: int, size: int) -> None:

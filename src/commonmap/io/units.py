@@ -19,22 +19,25 @@ MAX_EXTENT = 50_000.0
 MAX_COORDINATE = 1e8
 """Beyond this, metres, no projected CRS has a place: the point is a blunder."""
 
-METRE: dict[str, float] = {"": 1.0, "metre": 1.0, "meter": 1.0, "m": 1.0}
-
 
 def to_metres(
-    xyz: Float64s, crs: str | None, path: Path, *, vertical_factor: float | None = None
+    xyz: Float64s,
+    crs: str | None,
+    path: Path,
+    *,
+    units: tuple[float | None, float | None] = (None, None),
 ) -> tuple[Float64s, str | None]:
     """Return the points in metres, and their CRS as WKT with metric axes.
 
     xyz: (N, 3) in the units of the CRS. crs: WKT, or None for unknown.
-    vertical_factor: metres per unit of z where the file states it beside the CRS.
+    units: metres per unit of x and y, and of z, where the file states them beside the CRS; the
+        CRS goes first where it says the same thing.
 
     Raises `UnitsError` for a geographic or geocentric CRS. A CRS that cannot be parsed is told to
-    the log and left out. Without a vertical CRS, z is taken to be in the horizontal unit.
+    the log and left out. Where nothing names the unit of z, it is the horizontal one.
     """
     if crs is None:
-        return _scaled(xyz, 1.0, vertical_factor or 1.0), None
+        return _without_crs(xyz, path, units), None
     from pyproj import CRS
     from pyproj.exceptions import CRSError
 
@@ -44,7 +47,7 @@ def to_metres(
             parsed = CRS.from_user_input(crs)
     except (CRSError, UnicodeError, ValueError):
         log.warning("%s: its CRS cannot be read and is left out", path)
-        return _scaled(xyz, 1.0, vertical_factor or 1.0), None
+        return _without_crs(xyz, path, units), None
     if parsed.is_geographic:
         raise UnitsError(
             f"{path} is in degrees ({parsed.name}); reproject it to a metric CRS (UTM, say) first"
@@ -56,16 +59,10 @@ def to_metres(
         )
     horizontal, vertical = _factors(parsed, path)
     if vertical is None:
-        vertical = vertical_factor if vertical_factor is not None else horizontal
+        vertical = units[1] if units[1] is not None else horizontal
     if horizontal == 1.0 and vertical == 1.0:
         return xyz, parsed.to_wkt()
-    log.warning(
-        "%s: converted to metres from the units of %s (1 unit = %.10g m in x and y, %.10g m in z)",
-        path,
-        parsed.name,
-        horizontal,
-        vertical,
-    )
+    _tell(path, parsed.name, horizontal, vertical)
     metric = CRS.from_json_dict(_with_metric_axes(parsed.to_json_dict()))
     return _scaled(xyz, horizontal, vertical), metric.to_wkt()
 
@@ -84,7 +81,7 @@ def check_plausible(xyz: Float64s, crs: str | None, path: Path) -> None:
     if max(x, y) > MAX_EXTENT:
         raise UnitsError(
             f"{path} spreads over {max(x, y) / 1000.0:.0f} km if it is in metres; "
-            "it seems to be in millimetres (convert it to metres first)"
+            "it seems to be in millimetres, or its points lie in places far apart"
         )
     within = (np.abs(low[:2]) <= (180, 90)).all() and (np.abs(high[:2]) <= (180, 90)).all()
     if within and 0.0 < max(x, y) < 0.2 and z > 50.0 * max(x, y):
@@ -112,6 +109,24 @@ def _factors(crs: Any, path: Path) -> tuple[float, float | None]:
     return horizontal.pop(), vertical
 
 
+def _without_crs(xyz: Float64s, path: Path, units: tuple[float | None, float | None]) -> Float64s:
+    horizontal = units[0] if units[0] is not None else 1.0
+    vertical = units[1] if units[1] is not None else horizontal
+    if (horizontal, vertical) != (1.0, 1.0):
+        _tell(path, "its header", horizontal, vertical)
+    return _scaled(xyz, horizontal, vertical)
+
+
+def _tell(path: Path, whose: str, horizontal: float, vertical: float) -> None:
+    log.warning(
+        "%s: converted to metres from the units of %s (1 unit = %.10g m in x and y, %.10g m in z)",
+        path,
+        whose,
+        horizontal,
+        vertical,
+    )
+
+
 def _scaled(xyz: Float64s, horizontal: float, vertical: float) -> Float64s:
     if horizontal == 1.0 and vertical == 1.0:
         return xyz
@@ -119,12 +134,16 @@ def _scaled(xyz: Float64s, horizontal: float, vertical: float) -> Float64s:
     return scaled
 
 
+def _unbound(crs: dict[str, Any]) -> dict[str, Any]:
+    """Return the CRS inside one that is bound to another by a datum shift (TOWGS84)."""
+    inner: dict[str, Any] = crs["source_crs"] if crs.get("type") == "BoundCRS" else crs
+    return inner
+
+
 def _with_metric_axes(crs: dict[str, Any]) -> dict[str, Any]:
     """Return a CRS (PROJJSON) with its axes in metres; it loses the code of the original."""
     metric = copy.deepcopy(crs)
-    parts = metric.get("components", [metric])
-    if metric.get("type") == "BoundCRS":
-        parts = [metric["source_crs"]]
+    parts = [_unbound(part) for part in metric.get("components", [_unbound(metric)])]
     for part in parts:
         for axis in part.get("coordinate_system", {}).get("axis", []):
             axis["unit"] = "metre"
