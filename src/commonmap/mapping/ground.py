@@ -83,7 +83,9 @@ def typical_spacing(xyz: Float64s) -> float:
     coarse = max(1.0, float(extent.max()) / 4096.0)
     for _ in range(4):
         index = np.floor((xyz[:, :2] - xyz[:, :2].min(axis=0)) / coarse).astype(np.int64)
-        _, counts = np.unique(index[:, 0] * (index[:, 1].max() + 1) + index[:, 1], return_counts=True)
+        _, counts = np.unique(
+            index[:, 0] * (index[:, 1].max() + 1) + index[:, 1], return_counts=True
+        )
         median = float(np.median(counts))
         if median >= 4 or len(counts) < 16:
             break

@@ -86,7 +86,9 @@ def build_height_map(
     Raises EmptyMapError when nothing is left.
     """
     if not (np.isfinite(cell) and cell > 0):
-        raise InputError(f"the cell of a height map must be a positive length in metres; {cell} came")
+        raise InputError(
+            f"the cell of a height map must be a positive length in metres; {cell} came"
+        )
     if len(slab_edges) < 2 or len(slab_edges) > 33 or not np.all(np.diff(slab_edges) > 0):
         raise InputError("slab_edges must be 2 to 33 rising heights in metres")
     ground = ground or find_ground(xyz)

@@ -58,7 +58,9 @@ def find_level(xyz: Float64s) -> Levelling:
 
     # Roughly up: the map's own z, unless another direction has ground under everything
     points, normals = _patches(centred, 30_000)
-    up, own = _rough_up(points, normals) if len(points) >= 100 else (np.array([0.0, 0.0, 1.0]), True)
+    up, own = (
+        _rough_up(points, normals) if len(points) >= 100 else (np.array([0.0, 0.0, 1.0]), True)
+    )
     R_rough = rotation_between(up, (0.0, 0.0, 1.0))
 
     # Exactly up: the direction along which what stands above ground makes the sharpest plan

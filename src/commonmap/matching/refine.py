@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from commonmap.frames import apply, from_rotation
 from commonmap.mapping.ground import Ground
-from commonmap.types import Float64s
+from commonmap.types import Bools, Float64s
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,8 +27,7 @@ class Refined:
 
     T_target_source: (4, 4). centre: (3,) about which the covariance's rotation turns, target frame.
     covariance: (6, 6) of [x, y, z, rotation about x, y, z], metres and radians.
-    inlier_share: of the source's points within reach of the target's columns, how many lie within
-        one cell of a target point. rms: metres, robust, of the point-to-plane residuals.
+    rms: metres, robust, of the point-to-plane residuals.
     moved: (metres at the centre, radians) between the search's pose and this one.
     converged: False where the registration left the basin of the search's peak; then
         `T_target_source` is the pose that went in.
@@ -37,7 +36,6 @@ class Refined:
     T_target_source: Float64s
     centre: Float64s
     covariance: Float64s
-    inlier_share: float
     rms: float
     moved: tuple[float, float]
     converged: bool
@@ -117,14 +115,12 @@ def refine(
     stayed = shift <= 3.0 * cell and turn <= max(math.radians(3.0), 4.0 * cell / radius)
     if not stayed:
         T = np.eye(4)
-    share = _inlier_share(points, apply(T, source), cell)
     to_centre = from_rotation(np.eye(3), centre)
     from_centre = from_rotation(np.eye(3), -centre)
     return Refined(
         to_centre @ T @ from_centre @ start,
         centre,
         covariance,
-        share,
         rms,
         (shift, turn),
         stayed,
@@ -155,7 +151,7 @@ def _walk(target: Float64s, source: Float64s, cell: float, threads: int) -> Floa
 
 def _unrefined(start: Float64s, source_xyz: Float64s) -> Refined:
     centre = apply(start, source_xyz).mean(axis=0) if len(source_xyz) else start[:3, 3]
-    return Refined(start, centre, np.eye(6), 0.0, float("inf"), (0.0, 0.0), False)
+    return Refined(start, centre, np.eye(6), float("inf"), (0.0, 0.0), False)
 
 
 def _thin(xyz: Float64s, voxel: float, n_most: int) -> Float64s:
@@ -219,11 +215,29 @@ def _sum_by_area(xyz: Float64s, g: Float64s) -> Float64s:
     return np.column_stack([np.bincount(inverse, weights=g[:, a]) for a in range(6)])
 
 
-def _inlier_share(target: Float64s, source: Float64s, reach: float) -> float:
-    """Return how many source points near a known column of the target are near a target point."""
-    flat, _ = cKDTree(target[:, :2], balanced_tree=False).query(
-        source[:, :2], distance_upper_bound=reach
-    )
-    near, _ = cKDTree(target, balanced_tree=False).query(source, distance_upper_bound=reach)
-    n = int(np.count_nonzero(np.isfinite(flat)))
-    return float(np.count_nonzero(np.isfinite(near)) / n) if n else 0.0
+def share_of_inliers(
+    target: Float64s, target_standing: Bools, source: Float64s, source_standing: Bools, reach: float
+) -> float:
+    """Return how many standing source points over known columns lie near a standing target point.
+
+    target, source: (N, 3), (M, 3) in one frame. standing: masks of what rises above the ground (the
+    ground itself lies on the ground anywhere). reach: metres. 0 where nothing stands over known
+    columns; at most 20,000 source points are looked at.
+    """
+    draft = source[source_standing]
+    draft = draft[:: len(draft) // 20_000 + 1]
+    if len(draft) == 0 or not target_standing.any():
+        return 0.0
+    low, high = draft.min(axis=0) - reach, draft.max(axis=0) + reach
+    inside = np.all((target[:, :2] >= low[:2]) & (target[:, :2] <= high[:2]), axis=1)
+    base = _thin(target[inside], 0.5 * reach, 1_000_000) if inside.any() else target[:0]
+    upright = target[inside & target_standing]
+    if len(base) == 0 or len(upright) == 0:
+        return 0.0
+    upright = _thin(upright, 0.3 * reach, 1_000_000)
+    columns = np.unique(np.floor(base[:, :2] / reach).astype(np.int64), axis=0)
+    over, _ = cKDTree((columns + 0.5) * reach).query(draft[:, :2], distance_upper_bound=reach)
+    near, _ = cKDTree(upright).query(draft, distance_upper_bound=reach)
+    known = np.isfinite(over)
+    n = int(np.count_nonzero(known))
+    return float(np.count_nonzero(np.isfinite(near) & known) / n) if n else 0.0

@@ -7,7 +7,6 @@ same call: its best score is a draw of what chance alone reaches (the decoy).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -29,9 +28,7 @@ from commonmap.matching.evidence import (
     transform_target,
     xlogx_table,
 )
-from commonmap.types import Float64s
-
-Progress = Callable[[str, float], None]
+from commonmap.types import Float64s, Progress, no_progress
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +94,7 @@ def search(
     plan: SearchPlan | None = None,
     n_peaks: int = 16,
     workers: int = 2,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
 ) -> Peaks:
     """Return the best separate poses of `source` on `target`, both on cells of half the finest cell.
 
@@ -117,7 +114,7 @@ def search(
     pose, score, per_yaw = _search_all(
         coarse_target, columns, cell, yaws, min_overlap, workers, progress
     )
-    order = _separate(pose, score, 2.0 * cell, 3.0 * np.pi / plan.n_yaw, plan.keep[0])
+    order = separate(pose, score, 2.0 * cell, 3.0 * np.pi / plan.n_yaw, plan.keep[0])
     pose = pose[order]
 
     # Each candidate climbs at this cell, then at half of it, and so on
@@ -132,9 +129,22 @@ def search(
         last = level == len(levels) - 1
         keep = n_peaks if last else plan.keep[level + 1]
         apart = 2.0 * cell if not last else 4.0 * finest
-        order = _separate(pose, score, apart, (6.0 if last else 2.0) * yaw_step, keep)
+        order = separate(pose, score, apart, (6.0 if last else 2.0) * yaw_step, keep)
         pose, score, overlap = pose[order], score[order], overlap[order]
     return Peaks(pose, score, overlap, centre, per_yaw, finest)
+
+
+def evidence_at(target: SlabGrid, columns: Columns, pose: Float64s) -> tuple[float, int]:
+    """Return (evidence, known pairs of the best known slab) of one pose x, y, yaw.
+
+    columns: of the source, about the point that x, y place, on half the target's cell.
+    """
+    table = count_tables(
+        target.occupied, target.known, target.origin, target.cell, columns.xy, columns.occupied,
+        columns.known, columns.n_slabs, np.asarray(pose, np.float64)[None],
+    )[0]  # fmt: skip
+    xlogx = xlogx_table(int(table[:, 0].max(initial=0)) + 1)
+    return float(sum(signed_evidence(*row, xlogx) for row in table)), int(table[:, 0].max())
 
 
 def _at_cell(target: SlabGrid, source: SlabGrid, cell: float) -> tuple[SlabGrid, Columns]:
@@ -172,7 +182,7 @@ def _search_all(
     yaws: Float64s,
     min_overlap: float,
     workers: int,
-    progress: Progress | None,
+    progress: Progress,
 ) -> tuple[Float64s, Float64s, Float64s]:
     """Return the separate peaks of every yaw: poses (M, 3), scores (M,), and (yaw, best) pairs."""
     reach = float(np.hypot(*columns.xy.T).max())
@@ -194,8 +204,7 @@ def _search_all(
     with ThreadPoolExecutor(max_workers=workers) as pool:
         for n, peaks in enumerate(pool.map(one, yaws)):
             found.append(peaks)
-            if progress is not None and n % 16 == 0:
-                progress("search", (n + 1) / len(yaws))
+            progress("search", (n + 1) / len(yaws))
     pose = np.concatenate([f[:, :3] for f in found])
     score = np.concatenate([f[:, 3] for f in found])
     best = np.array([f[:, 3].max(initial=-np.inf) for f in found])
@@ -226,7 +235,7 @@ def _search_yaw(
         float(np.cos(yaw)), float(np.sin(yaw)), cell, low, side, side,
     )  # fmt: skip
     score, _ = evidence_surface(spectra, occupied, known, min_overlap=min_pairs, workers=1)
-    index = _local_maxima(score, n_peaks)
+    index = local_maxima(score, n_peaks, 0.0)
     index = index[index[:, 0] >= 0]
     xy = target.origin + (index - (side - 1)) * cell - low
     values = score[index[:, 0], index[:, 1]].astype(np.float64)
@@ -234,15 +243,15 @@ def _search_yaw(
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
-def _local_maxima(score, n_peaks):  # type: ignore[no-untyped-def]
-    """Return the indices (n_peaks, 2) of the highest 3x3 local maxima, best first, -1 where none."""
+def local_maxima(score, n_peaks, above):  # type: ignore[no-untyped-def]
+    """Return the indices (n_peaks, 2) of the highest 3x3 local maxima over `above`, -1 where none."""
     index = np.full((n_peaks, 2), -1, np.int64)
     value = np.full(n_peaks, -np.inf)
     n_u, n_v = score.shape
     for u in range(n_u):
         for v in range(n_v):
             s = score[u, v]
-            if not s > value[-1] or s <= 0.0:
+            if not s > value[-1] or s <= above:
                 continue
             peak = True
             for a in range(max(u - 1, 0), min(u + 2, n_u)):
@@ -262,7 +271,7 @@ def _local_maxima(score, n_peaks):  # type: ignore[no-untyped-def]
     return index
 
 
-def _separate(
+def separate(
     pose: Float64s, score: Float64s, distance: float, yaw: float, n: int
 ) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
     """Return the indices of the best poses, best first, no two of them nearer than both limits."""
