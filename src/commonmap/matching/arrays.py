@@ -89,33 +89,41 @@ def invert(arrays: Arrays, spectra: Array, shape: tuple[int, int], workers: int)
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract", "nsz"})
 def _multiply_add(
-    U: Array, W: Array, first: Array, f: Array, w: Array, out: Array
+    U: Array, W: Array, first: Array, f: Array, w: Array, out: Array, turned: Array
 ) -> None:  # pragma: no cover
-    """out[m] = sum U[f] W[w]; U, out: (., F, 2) interleaved, W: (., 2, F) planar. In blocks that
-    stay in the cache; each element's sum runs in the order of the pairs, whatever the block."""
+    """out[m] = sum U[f] W[w], turned[m] = sum conj(U[f]) W[w], where they have rows.
+
+    U, out, turned: (., F, 2) interleaved, W: (., 2, F) planar. In blocks that stay in the cache;
+    the sum at each frequency runs in the order of the pairs, whatever the block.
+    """
     n = U.shape[1]
     block = 1024
     u = np.empty((U.shape[0], 2, block), U.dtype)
-    total = np.empty((2, block), U.dtype)
+    s = np.empty((4, block), U.dtype)
     for start in range(0, n, block):
         size = min(block, n - start)
         for k in range(U.shape[0]):
             for i in range(size):
                 u[k, 0, i] = U[k, start + i, 0]
                 u[k, 1, i] = U[k, start + i, 1]
-        for m in range(out.shape[0]):
-            for i in range(size):
-                total[0, i] = 0.0
-                total[1, i] = 0.0
+        for m in range(first.shape[0] - 1):
+            s[:] = 0.0
             for k in range(first[m], first[m + 1]):
                 re, im = u[f[k], 0], u[f[k], 1]
                 wr, wi = W[w[k], 0, start : start + size], W[w[k], 1, start : start + size]
                 for i in range(size):
-                    total[0, i] += re[i] * wr[i] - im[i] * wi[i]
-                    total[1, i] += re[i] * wi[i] + im[i] * wr[i]
-            for i in range(size):
-                out[m, start + i, 0] = total[0, i]
-                out[m, start + i, 1] = total[1, i]
+                    s[0, i] += re[i] * wr[i]
+                    s[1, i] += im[i] * wi[i]
+                    s[2, i] += re[i] * wi[i]
+                    s[3, i] += im[i] * wr[i]
+            if out.shape[0] > 0:
+                for i in range(size):
+                    out[m, start + i, 0] = s[0, i] - s[1, i]
+                    out[m, start + i, 1] = s[2, i] + s[3, i]
+            if turned.shape[0] > 0:
+                for i in range(size):
+                    turned[m, start + i, 0] = s[0, i] + s[1, i]
+                    turned[m, start + i, 1] = s[2, i] - s[3, i]
 
 
 def pack(arrays: Arrays, spectra: Array) -> Array:
@@ -127,23 +135,33 @@ def pack(arrays: Arrays, spectra: Array) -> Array:
 
 
 def multiply_add(
-    arrays: Arrays, U: Array, W: Array, pairs: Sequence[Sequence[tuple[int, int]]]
-) -> Array:
-    """Return, per list of pairs (f, w), the spectrum `sum U[f] * W[w]`; W as `pack` returns it."""
+    arrays: Arrays,
+    U: Array,
+    W: Array,
+    pairs: Sequence[Sequence[tuple[int, int]]],
+    turns: Sequence[bool] = (False,),
+) -> list[Array]:
+    """Return, per turn, the spectra `sum U[f] * W[w]` of each list of pairs (f, w).
+
+    W: as `pack` returns it. A half turn of the source conjugates U (up to a shift).
+    """
     shape = (len(pairs), *U.shape[1:])
     if arrays.name == "numpy":
-        out = np.empty(shape, U.dtype)
+        outs = {turn: np.empty(shape, U.dtype) for turn in turns}
+        none = np.empty((0, *U.shape[1:]), U.dtype)
         flat = [pair for some in pairs for pair in some]
         first = np.cumsum([0, *(len(some) for some in pairs)])
         f, w = (np.array([pair[k] for pair in flat]) for k in (0, 1))
-        real = W.dtype
-        _multiply_add(
-            U.view(real).reshape(U.shape[0], -1, 2), W, first, f, w,
-            out.view(real).reshape(len(pairs), -1, 2),
-        )  # fmt: skip
-        return out
-    out = arrays.xp.zeros(shape, U.dtype)
-    for m, some in enumerate(pairs):
-        for source, target in some:
-            out[m] += U[source] * W[target]
-    return out
+        planes = [U, outs.get(False, none), outs.get(True, none)]
+        u, out, turned = (x.view(W.dtype).reshape(x.shape[0], W.shape[-1], 2) for x in planes)
+        _multiply_add(u, W, first, f, w, out, turned)
+        return [outs[turn] for turn in turns]
+    results = []
+    for turn in turns:
+        total = arrays.xp.zeros(shape, U.dtype)
+        V = U.conj() if turn else U
+        for m, some in enumerate(pairs):
+            for source, target in some:
+                total[m] += V[source] * W[target]
+        results.append(total)
+    return results

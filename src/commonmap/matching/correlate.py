@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from commonmap.errors import EmptyMapError, InputError
 from commonmap.matching import roads
 from commonmap.matching.arrays import Array, choose_shape, find_arrays
-from commonmap.matching.special import Poses, find_special
+from commonmap.matching.special import Poses, Special, find_specials
 from commonmap.metrics.plans import (
     A_SUM,
     B_SUM,
@@ -265,28 +265,77 @@ def score_surface(
     bound: also return how far each score may be from the literal formula. workers: threads of
     the transforms; the result is the same to the bit for any number.
     """
-    frame, names = prepared.frame, prepared.names
-    xp = frame.arrays.xp
-    h, known = _source_heights(prepared, height_s, known_s)
+    return _score(prepared, height_s, known_s, (False,), bound, workers)[0]
 
-    # the moments over the overlap of every pose, (Sx, Sy) each; the first is the number of cells
-    outputs, rounding = prepared.moments.correlate(h, known, workers=workers)
-    n, counted = _count(prepared, outputs[0], float(rounding[0]), known, workers)
-    n_overlap = frame.place(n.astype(np.int32), 0)
-    if not bool(counted.any()):
-        nothing = np.full(frame.out_shape, np.nan)
-        return Surface(nothing, n_overlap, frame.source_shape, nothing if bound else None)
-    n = xp.where(counted, n, 1.0).astype(np.float64)
+
+def score_half_turns(
+    prepared: PreparedTarget,
+    height_s: Floats,
+    known_s: Bools,
+    *,
+    bound: bool = False,
+    workers: int = 1,
+) -> tuple[Surface, Surface]:
+    """Return the surfaces of the source and of the source after half a turn, for less than two.
+
+    The second is that of `height_s[::-1, ::-1]`, after padding to the prepared source shape: half a
+    turn only conjugates spectra, so source transforms and products serve both. Scores agree
+    with those of `score_surface` within the bound, not to the bit.
+    """
+    first, second = _score(prepared, height_s, known_s, (False, True), bound, workers)
+    return first, second
+
+
+def _score(
+    prepared: PreparedTarget,
+    height_s: Floats,
+    known_s: Bools,
+    turns: tuple[bool, ...],
+    bound: bool,
+    workers: int,
+) -> list[Surface]:
+    h, known = _source_heights(prepared, height_s, known_s)
+    # the moments over the overlap of every pose, (m, Sx, Sy); the first is the number of cells
+    moments, rounding = prepared.moments.correlate(h, known, turns=turns, workers=workers)
+    poses = []
+    for outputs, turn in zip(moments, turns, strict=True):
+        seen = known[::-1, ::-1] if turn else known
+        n, counted = _count(prepared, outputs[0], float(rounding[0]), seen, workers)
+        poses.append(_gather(prepared, outputs, rounding, n, counted, float(h[known].sum())))
+    # the one sum that is not a moment
+    specials = find_specials(prepared, h, known, poses, turns, workers)
+    return [
+        _combine(prepared, some, special, bound)
+        for some, special in zip(poses, specials, strict=True)
+    ]
+
+
+def _gather(
+    prepared: PreparedTarget,
+    outputs: Array,
+    rounding: Float64s,
+    n: Array,
+    counted: Array,
+    total_s: float,
+) -> Poses:
+    """Return what the moments say of all poses, in double precision."""
+    xp, names = prepared.frame.arrays.xp, prepared.names
+    safe = xp.where(counted, n, 1.0).astype(np.float64)
     values = {name: outputs[k].astype(np.float64) for k, name in enumerate(names) if name != "n"}
-    errors: dict[str, Any] = {name: float(rounding[k]) for k, name in enumerate(names)}
+    errors = {name: float(rounding[k]) for k, name in enumerate(names) if name != "n"}
     if prepared.metric.needs_positive:  # what rounding cannot know where hardly a cell overlaps
         for name in ("a", "b"):
             if name in values:
-                values[name] = xp.maximum(values[name], n * prepared.floor)
+                values[name] = xp.maximum(values[name], safe * prepared.floor)
+    return Poses(safe, n, counted, values, errors, total_s, prepared.total)
 
-    # the one sum that is not a moment
-    poses = Poses(n, counted, values, errors, float(h[known].sum()), prepared.total)
-    special = find_special(prepared, h, known, poses, workers)
+
+def _combine(
+    prepared: PreparedTarget, poses: Poses, special: Special | None, bound: bool
+) -> Surface:
+    """Return the surface of the metric from its sums; NaN where a pose does not count."""
+    frame, xp = prepared.frame, prepared.frame.arrays.xp
+    n_overlap = frame.place(poses.n_seen.astype(np.int32), 0)
 
     def score(values: dict[str, Array], push: float = 0.0) -> Array:
         A, B = poses.scales(prepared.normalise, values)
@@ -294,24 +343,26 @@ def score_surface(
         if special is not None:
             extra = special.error(A, B, values) if push else 0.0
             sums[special.name] = special.evaluate(A, B) + push * extra
-        return prepared.combine(Sums(n, A, B, sums, errors))
+        return prepared.combine(Sums(poses.n, A, B, sums, poses.errors))
 
     with np.errstate(all="ignore"):
-        result = score(values)
+        result = score(poses.values)
         spread = None
-        if bound:
-            # first-order propagation, by trying each sum at both ends of its own error
-            spread = 1e-12 * (1.0 + np.abs(result))
-            ends = [(k, e + prepared.moved(k, values[k], n)) for k, e in errors.items() if k != "n"]
-            trials = [({**values, k: values[k] + e}, {**values, k: values[k] - e}) for k, e in ends]
-            pairs = [(score(up), score(down)) for up, down in trials]
+        if bound:  # first-order propagation, by trying each sum at both ends of its own error
+            trials = []
+            for name, error in poses.errors.items():
+                value = poses.values[name]
+                off = error + prepared.moved(name, value, poses.n)
+                trials.append(score({**poses.values, name: value + off}))
+                trials.append(score({**poses.values, name: value - off}))
             if special is not None:
-                pairs.append((score(values, 1.0), score(values, -1.0)))
-            for up, down in pairs:
+                trials += [score(poses.values, 1.0), score(poses.values, -1.0)]
+            spread = 1e-12 * (1.0 + np.abs(result))
+            for up, down in zip(trials[::2], trials[1::2], strict=True):
                 spread = spread + xp.fmax(np.abs(up - result), np.abs(down - result))
-            spread = frame.place(xp.where(counted, spread, np.nan), np.nan)
-        result = frame.place(xp.where(counted, result, np.nan), np.nan)
-    return Surface(result, n_overlap, frame.source_shape, spread)
+            spread = frame.place(xp.where(poses.counted, spread, np.nan), np.nan)
+    whole = frame.place(xp.where(poses.counted, result, np.nan), np.nan)
+    return Surface(whole, n_overlap, frame.source_shape, spread)
 
 
 def score_surfaces(

@@ -52,12 +52,16 @@ class Frame:
         placed = self.arrays.xp.asarray(layers.astype(self.dtype))
         return fourier.transform(self.arrays, placed, self.shape, workers)
 
-    def correlate(self, spectra: Array, workers: int) -> Array:
+    def correlate(self, spectra: Array, workers: int, *, turned: bool = False) -> Array:
         """Return the correlations (m, ...) of products of spectra, which are overwritten.
 
         The surface as far as the transforms tell its shifts apart; `place` makes it whole.
+        turned: the source's spectra were conjugated, which turns it round and shifts it.
         """
         layers = fourier.invert(self.arrays, spectra, self.shape, workers)
+        if turned:
+            sx, sy = self.source_shape
+            layers = self.arrays.xp.roll(layers, (sx - 1, sy - 1), axis=(-2, -1))
         return layers[:, : self.out_shape[0], : self.out_shape[1]]
 
     def place(self, seen: Array, fill: float) -> Array:
@@ -91,24 +95,38 @@ class Products:
     target_norm: Float64s
 
     def correlate(
-        self, h: Float64s, known: Bools, *, weights: Float64s | None = None, workers: int = 1
-    ) -> tuple[Array, Float64s]:
-        """Return the outputs (m, Sx, Sy), and what rounding may have added to each, (m,).
+        self,
+        h: Float64s,
+        known: Bools,
+        *,
+        turns: Sequence[bool] = (False,),
+        weights: Sequence[Float64s] | None = None,
+        workers: int = 1,
+    ) -> tuple[list[Array], Float64s]:
+        """Return per turn the outputs (m, ...), and what rounding may have added to each, (m,).
 
-        weights: (m,), sums the outputs to a single one before its inverse transform.
+        turns: False for the source as it is, True for the source after half a turn.
+        weights: per turn (m,), to sum the outputs to a single one before its inverse transform.
         """
         layers = self.layers(h, known)
         U = self.frame.source_spectra(layers, workers)
-        spectra = fourier.multiply_add(self.frame.arrays, U, self.spectra, self.pairs)
+        outputs = fourier.multiply_add(self.frame.arrays, U, self.spectra, self.pairs, turns)
         norms = norm(layers)
         rounding = self.frame.rounding * np.array(
             [sum(norms[f] * self.target_norm[w] for f, w in some) for some in self.pairs]
         )
         if weights is not None:
-            factor = self.frame.arrays.xp.asarray(weights.astype(self.frame.dtype))
-            spectra = (spectra * factor[:, None, None]).sum(axis=0, keepdims=True)
-            rounding = np.array([np.abs(weights) @ rounding])
-        return self.frame.correlate(spectra, workers), rounding
+            factors = [self.frame.arrays.xp.asarray(w.astype(self.frame.dtype)) for w in weights]
+            outputs = [
+                (spectra * factor[:, None, None]).sum(axis=0, keepdims=True)
+                for spectra, factor in zip(outputs, factors, strict=True)
+            ]
+            rounding = np.array([rounding.sum()])  # |T_m| <= 1
+        surfaces = [
+            self.frame.correlate(spectra, workers, turned=turn)
+            for spectra, turn in zip(outputs, turns, strict=True)
+        ]
+        return surfaces, rounding
 
 
 def _evaluate(name: str, h: Float64s, known: Bools, unit: float) -> Float64s:

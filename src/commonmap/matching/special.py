@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -24,11 +24,13 @@ WIDEN = 0.25
 class Poses:
     """What the moments say of all poses: arrays (Sx, Sy).
 
-    n: cells, 1 where not counted. values: the moments, errors: what rounding may have added.
-    total_s, total_t: sums of the whole maps.
+    n: cells, 1 where not counted. n_seen: cells. counted: enough of them. values: the
+    moments. errors: what rounding may have added. total_s, total_t: sums
+    of the whole maps.
     """
 
     n: Array
+    n_seen: Array
     counted: Array
     values: dict[str, Array]
     errors: dict[str, Any]
@@ -51,15 +53,33 @@ class Special:
     error: Callable[[Any, Any, Mapping[str, Array]], Any]
 
 
-def find_special(
+def find_specials(
+    prepared: PreparedTarget,
+    h: Float64s,
+    known: Bools,
+    poses: Sequence[Poses],
+    turns: Sequence[bool],
+    workers: int,
+) -> list[Special | None]:
+    """Return, per turn, the sum that the metric's plan has besides moments, or None."""
+    plan = prepared.metric.fft
+    if isinstance(plan, Smooth):
+        return [*_kernels(prepared, plan, h, known, poses, turns, workers)]
+    return [
+        _find_special(
+            prepared, h[::-1, ::-1] if turn else h, known[::-1, ::-1] if turn else known, some,
+            workers,
+        )
+        for some, turn in zip(poses, turns, strict=True)
+    ]  # fmt: skip
+
+
+def _find_special(
     prepared: PreparedTarget, h: Float64s, known: Bools, poses: Poses, workers: int
 ) -> Special | None:
-    """Return the sum that the metric's plan has besides moments, or None."""
     plan = prepared.metric.fft
     if plan is None or isinstance(plan, Moments):
         return None
-    if isinstance(plan, Smooth):
-        return _kernel(prepared, plan, h, known, poses, workers)
     assert prepared.classes is not None
     if isinstance(plan, JointHistogram):
         frame = prepared.frame
@@ -76,20 +96,39 @@ def find_special(
     return _minimum(prepared, h, known, poses, workers)
 
 
-def _span(g: Any, counted: Array, unit: float) -> tuple[float, float]:
-    """Return the range of g over the counted poses, widened to multiples of `unit`."""
-    over = g[counted] if getattr(g, "ndim", 0) else g
-    low, high = float(np.min(over)), float(np.max(over))
+def _span(ranges: Sequence[tuple[float, float]], unit: float) -> tuple[float, float]:
+    """Return a range that holds all of them, widened to multiples of `unit`."""
+    low, high = min(low for low, _ in ranges), max(high for _, high in ranges)
     return float(np.floor(low / unit - 1e-3) * unit), float(np.ceil(high / unit + 1e-3) * unit)
 
 
-def _kernel(
-    prepared: PreparedTarget, plan: Smooth, h: Float64s, known: Bools, poses: Poses, workers: int
-) -> Special:
-    """Return `sum P^alpha Q^beta psi(ln(Q / P))` by the expansion."""
-    A, B = poses.scales(prepared.normalise, poses.values)
+def _range(g: Any, counted: Array) -> tuple[float, float]:
+    """Return the least and the largest g over the counted poses."""
+    if getattr(g, "ndim", 0) == 0:
+        return float(g), float(g)
+    xp_min, xp_max = np.where(counted, g, np.inf).min(), np.where(counted, g, -np.inf).max()
+    return float(xp_min), float(xp_max)
+
+
+def _kernels(
+    prepared: PreparedTarget,
+    plan: Smooth,
+    h: Float64s,
+    known: Bools,
+    poses: Sequence[Poses],
+    turns: Sequence[bool],
+    workers: int,
+) -> list[Special]:
+    """Return, per turn, `sum P^alpha Q^beta (psi(s) + linear s)`, s = ln(Q / P), by expansion."""
+    ratios = []
+    for some in poses:
+        A, B = some.scales(prepared.normalise, some.values)
+        ratios.append(np.log(A / B))
     constant = prepared.normalise != "overlap"
-    span = (0.0, 0.0) if prepared.normalise == "off" else _span(np.log(A / B), poses.counted, WIDEN)
+    span = (0.0, 0.0)
+    if prepared.normalise != "off":
+        ranges = [_range(g, some.counted) for g, some in zip(ratios, poses, strict=True)]
+        span = _span(ranges, WIDEN)
     with prepared.lock:
         if span not in prepared.kernels:
             prepared.kernels[span] = roads.kernel_products(
@@ -104,37 +143,45 @@ def _kernel(
             )
         kernel = prepared.kernels[span]
     separated = kernel.separated
+    nodes = len(separated.pairs)
 
-    def position(A: Any, B: Any) -> Any:
+    def position(g: Any) -> Any:
         if separated.half == 0.0:
-            return 0.0 * A
-        return np.clip((np.log(A / B) - separated.middle) / separated.half, -1.0, 1.0)
+            return 0.0 * g
+        return np.clip((g - separated.middle) / separated.half, -1.0, 1.0)
 
     weights = None
     if constant:
-        nodes = separated.target.shape[0]
-        weights = np.cos(np.arange(nodes) * np.arccos(position(A, B)))
-    outputs, rounding = kernel.products.correlate(h, known, weights=weights, workers=workers)
+        weights = [np.cos(np.arange(nodes) * np.arccos(position(g))) for g in ratios]
+    outputs, rounding = kernel.products.correlate(
+        h, known, turns=turns, weights=weights, workers=workers
+    )
     off = float(rounding.sum())
 
     def scale(A: Any, B: Any) -> Any:
+        if (plan.alpha, plan.beta) == (1.0, 0.0):
+            return A
         return A**plan.alpha * B**plan.beta
 
-    def evaluate(A: Any, B: Any) -> Array:
-        if constant:
-            return outputs[0].astype(np.float64) / scale(A, B)
-        return roads.chebyshev_sum(prepared.frame.arrays, outputs, position(A, B)) / scale(A, B)
+    def special(some: Poses, output: Array) -> Special:
+        def evaluate(A: Any, B: Any) -> Array:
+            if constant:
+                return output[0].astype(np.float64) / scale(A, B)
+            sums = roads.chebyshev_sum(prepared.frame.arrays, output, position(np.log(A / B)))
+            return sums / scale(A, B)
 
-    def error(A: Any, B: Any, values: Mapping[str, Array]) -> Any:
-        # sum a^alpha b^beta is n, sum a, or at most sqrt(sum a sum b)
-        mass = poses.n ** (1.0 - plan.alpha - plan.beta)
-        if plan.alpha:
-            mass = mass * values["a"] ** plan.alpha
-        if plan.beta:
-            mass = mass * values["b"] ** plan.beta
-        return (off + separated.error * mass) / scale(A, B)
+        def error(A: Any, B: Any, values: Mapping[str, Array]) -> Any:
+            # sum a^alpha b^beta is n, sum a, or at most sqrt(sum a sum b)
+            mass = some.n ** (1.0 - plan.alpha - plan.beta)
+            if plan.alpha:
+                mass = mass * values["a"] ** plan.alpha
+            if plan.beta:
+                mass = mass * values["b"] ** plan.beta
+            return (off + separated.error * mass) / scale(A, B)
 
-    return Special("kernel", evaluate, error)
+        return Special("kernel", evaluate, error)
+
+    return [special(some, output) for some, output in zip(poses, outputs, strict=True)]
 
 
 def _over_classes(
@@ -157,7 +204,7 @@ def _over_classes(
     assert classes is not None
     frame, step = prepared.frame, classes.steps.step
     U, norms = classes.source(h, known, workers, weighted=weighted)
-    low, high = _span(g, poses.counted, step)
+    low, high = _span([_range(g, poses.counted)], step)
     first, last = round(low / step), round(high / step)
     total = frame.arrays.xp.zeros(poses.n.shape, np.float64)
     position = g / step
