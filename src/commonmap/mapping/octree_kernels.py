@@ -100,16 +100,107 @@ def _dilate(k, low, axis, shift):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)  # type: ignore[misc]
-def trace(  # type: ignore[no-untyped-def]
-    first, origins, ends, state, resolution, low, bits, table, tiles, n_tiles, words, touched, at
-):
-    """Set the bit of every voxel that a ray passes before its end; return (rays done, tiles).
+def _tile(here, table, tiles, n_tiles):  # type: ignore[no-untyped-def]
+    """Return the tile of an address, a new one where there is none, and their number."""
+    tile = np.int64(table[here >> 15])
+    if tile < 0:
+        tile = n_tiles
+        table[here >> 15] = tile
+        tiles[tile] = here >> 15
+        n_tiles += 1
+    return tile, n_tiles
 
-    first: the ray to begin with. low: (3,) lowest tile of the box; bits: (3,) bits of the tile's
-    number along each axis. table: tile of an address, or -1; tiles: the address of each tile;
-    words, touched: bits, and marks of cubes of 8^3, of all tiles. at: (N,) is filled with the
-    address of each hit, -1 where there is none. Stops early where tiles run out: more are made
-    and the loop goes on with the ray it stopped at, setting the same bits again.
+
+@numba.njit(cache=True)  # type: ignore[misc]
+def mark_ends(  # type: ignore[no-untyped-def]
+    first, ends, state, resolution, low, bits, table, tiles, n_tiles, touched, at
+):
+    """Fill the address of each hit, -1 where there is none; return (points done, tiles).
+
+    Arguments as of `trace`. Stops early where tiles run out.
+    """
+    factor = 1.0 / resolution
+    shift_x = np.int64(15)
+    shift_y = shift_x + bits[0]
+    shift_z = shift_y + bits[1]
+    for n in range(first, ends.shape[0]):
+        at[n] = -1
+        if state[n] != HIT:
+            continue
+        if n_tiles >= tiles.shape[0]:
+            return n, n_tiles
+        end = (
+            _dilate(key_of(ends[n, 0], factor), low[0], 0, shift_x)
+            | _dilate(key_of(ends[n, 1], factor), low[1], 1, shift_y)
+            | _dilate(key_of(ends[n, 2], factor), low[2], 2, shift_z)
+        )
+        tile, n_tiles = _tile(end, table, tiles, n_tiles)
+        touched[tile << 6 | (end >> 9) & 63] = 1
+        at[n] = tile << 15 | end & 0x7FFF
+    return ends.shape[0], n_tiles
+
+
+@numba.njit(cache=True, inline="always")  # type: ignore[misc]
+def _advance(here, x, y, z, dx, dy, dz, sx, sy, sz, mx, my, mz):  # type: ignore[no-untyped-def]
+    """Step over the border that comes first, without a branch; return address and ray parameters.
+
+    x, y, z: ray parameter of the next border along each axis; d: their growth; s: what a step adds
+    to the bits of the address under the mask m.
+    """
+    x_y, x_z, y_z = x < y, x < z, y < z
+    go_x = x_y & x_z
+    go_y = (not x_y) & y_z
+    mask = mx if go_x else (my if go_y else mz)
+    step = sx if go_x else (sy if go_y else sz)
+    here = (here & ~mask) | (((here & mask) + step) & mask)
+    x += dx if go_x else 0.0
+    y += dy if go_y else 0.0
+    z += 0.0 if go_x | go_y else dz
+    return here, x, y, z
+
+
+@numba.njit(cache=True, inline="always")  # type: ignore[misc]
+def _start(  # type: ignore[no-untyped-def]
+    n, stride, origins, ends, resolution, factor, low, shift_x, shift_y, shift_z
+):
+    """Return where ray `n` begins and ends and how it runs: begin equals end for an empty ray."""
+    x0, y0, z0 = origins[n * stride, 0], origins[n * stride, 1], origins[n * stride, 2]
+    x1, y1, z1 = ends[n, 0], ends[n, 1], ends[n, 2]
+    kx, ky, kz = key_of(x0, factor), key_of(y0, factor), key_of(z0, factor)
+    lx, ly, lz = key_of(x1, factor), key_of(y1, factor), key_of(z1, factor)
+    if kx < 0 or ky < 0 or kz < 0:
+        kx, ky, kz = lx, ly, lz
+    end = (
+        _dilate(lx, low[0], 0, shift_x)
+        | _dilate(ly, low[1], 1, shift_y)
+        | _dilate(lz, low[2], 2, shift_z)
+    )
+    here = (
+        _dilate(kx, low[0], 0, shift_x)
+        | _dilate(ky, low[1], 1, shift_y)
+        | _dilate(kz, low[2], 2, shift_z)
+    )
+    dx, dy, dz = x1 - x0, y1 - y0, z1 - z0
+    length = np.float32(np.sqrt(np.float64(dx * dx + dy * dy + dz * dz)))
+    sx, tx, ddx = ray(x0, x1, kx, resolution, length)
+    sy, ty, ddy = ray(y0, y1, ky, resolution, length)
+    sz, tz, ddz = ray(z0, z1, kz, resolution, length)
+    reach = (abs(kx - lx) + abs(ky - ly) + abs(kz - lz)) // 32 + 8
+    return here, end, np.float64(length), tx, ty, tz, ddx, ddy, ddz, sx, sy, sz, reach
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def trace(  # type: ignore[no-untyped-def]
+    first, last, origins, ends, state, resolution, low, bits, table, tiles, n_tiles, words, touched
+):
+    """Set the bit of every voxel that rays first..last pass before their end.
+
+    Returns (rays done, tiles). low: (3,) lowest tile of the box; bits: (3,) bits of a tile's number
+    along each axis. table: tile of an address, or -1; tiles: the address of each tile; words,
+    touched: bits, and marks of cubes of 8^3, of all tiles. Stops early where tiles may run out; it
+    may then be called again from the ray it stopped at.
+
+    Two rays go side by side: the processor works on one while it waits for the other.
     """
     factor = 1.0 / resolution
     stride = 0 if origins.shape[0] == 1 else 1
@@ -117,77 +208,102 @@ def trace(  # type: ignore[no-untyped-def]
     shift_y = shift_x + bits[0]
     shift_z = shift_y + bits[1]
     one = np.int64(1)
-    mask_x = np.int64(0o11111) | ((one << bits[0]) - 1) << shift_x
-    mask_y = np.int64(0o22222) | ((one << bits[1]) - 1) << shift_y
-    mask_z = np.int64(0o44444) | ((one << bits[2]) - 1) << shift_z
+    mx = np.int64(0o11111) | ((one << bits[0]) - 1) << shift_x
+    my = np.int64(0o22222) | ((one << bits[1]) - 1) << shift_y
+    mz = np.int64(0o44444) | ((one << bits[2]) - 1) << shift_z
     capacity = tiles.shape[0]
-    for n in range(first, ends.shape[0]):
-        at[n] = -1
-        if state[n] == OUT:
-            continue
-        x1, y1, z1 = ends[n, 0], ends[n, 1], ends[n, 2]
-        kx, ky, kz = key_of(x1, factor), key_of(y1, factor), key_of(z1, factor)
-        end = (
-            _dilate(kx, low[0], 0, shift_x)
-            | _dilate(ky, low[1], 1, shift_y)
-            | _dilate(kz, low[2], 2, shift_z)
-        )
-        if state[n] == HIT:
-            tile = np.int64(table[end >> 15])
-            if tile < 0:
-                if n_tiles >= capacity:
-                    return n, n_tiles
-                tile = n_tiles
-                table[end >> 15] = tile
-                tiles[tile] = end >> 15
-                n_tiles += 1
-            touched[tile << 6 | (end >> 9) & 63] = 1
-            at[n] = tile << 15 | end & 0x7FFF
-        x0, y0, z0 = origins[n * stride, 0], origins[n * stride, 1], origins[n * stride, 2]
-        kx, ky, kz = key_of(x0, factor), key_of(y0, factor), key_of(z0, factor)
-        if kx < 0 or ky < 0 or kz < 0:
-            continue
-        here = (
-            _dilate(kx, low[0], 0, shift_x)
-            | _dilate(ky, low[1], 1, shift_y)
-            | _dilate(kz, low[2], 2, shift_z)
-        )
-        if here == end:
-            continue
-        dx, dy, dz = x1 - x0, y1 - y0, z1 - z0
-        length = np.float32(np.sqrt(np.float64(dx * dx + dy * dy + dz * dz)))
-        sx, tx, ddx = ray(x0, x1, kx, resolution, length)
-        sy, ty, ddy = ray(y0, y1, ky, resolution, length)
-        sz, tz, ddz = ray(z0, z1, kz, resolution, length)
-        step_x = -mask_x if sx > 0 else -one
-        step_y = -mask_y if sy > 0 else -one
-        step_z = -mask_z if sz > 0 else -one
-        limit = np.float64(length)
-        while True:
-            tile = np.int64(table[here >> 15])
-            if tile < 0:
-                if n_tiles >= capacity:
-                    return n, n_tiles
-                tile = n_tiles
-                table[here >> 15] = tile
-                tiles[tile] = here >> 15
-                n_tiles += 1
-            words[tile << 9 | (here >> 6) & 511] |= one << (here & 63)
-            touched[tile << 6 | (here >> 9) & 63] = 1
-            # the axis whose border comes first, without a branch
-            x_y, x_z, y_z = tx < ty, tx < tz, ty < tz
-            go_x = x_y & x_z
-            go_y = (not x_y) & y_z
-            go_z = (not go_x) & (not go_y)
-            mask = mask_x if go_x else (mask_y if go_y else mask_z)
-            step = step_x if go_x else (step_y if go_y else step_z)
-            here = (here & ~mask) | (((here & mask) + step) & mask)
-            tx += ddx if go_x else 0.0
-            ty += ddy if go_y else 0.0
-            tz += ddz if go_z else 0.0
-            if here == end or min(min(tx, ty), tz) > limit:
+    a_here = a_end = b_here = b_end = np.int64(0)
+    a_sx = a_sy = a_sz = b_sx = b_sy = b_sz = np.int64(0)
+    a_x = a_y = a_z = a_dx = a_dy = a_dz = a_length = 0.0
+    b_x = b_y = b_z = b_dx = b_dy = b_dz = b_length = 0.0
+    a_on = b_on = False
+    n = first
+    short = False
+    reserved = 0
+    while True:
+        while not (a_on and b_on) and n < last and not short:
+            if state[n] == OUT:
+                n += 1
+                continue
+            here, end, length, x, y, z, dx, dy, dz, sx, sy, sz, reach = _start(
+                n, stride, origins, ends, resolution, factor, low, shift_x, shift_y, shift_z
+            )
+            if here == end:
+                n += 1
+                continue
+            if not (a_on or b_on):
+                reserved = n_tiles
+            if max(reserved, n_tiles) + reach > capacity:
+                short = True
                 break
-    return ends.shape[0], n_tiles
+            reserved = max(reserved, n_tiles) + reach
+            n += 1
+            sx = -mx if sx > 0 else -one
+            sy = -my if sy > 0 else -one
+            sz = -mz if sz > 0 else -one
+            if not a_on:
+                a_on, a_here, a_end, a_length = True, here, end, length
+                a_x, a_y, a_z, a_dx, a_dy, a_dz = x, y, z, dx, dy, dz
+                a_sx, a_sy, a_sz = sx, sy, sz
+            else:
+                b_on, b_here, b_end, b_length = True, here, end, length
+                b_x, b_y, b_z, b_dx, b_dy, b_dz = x, y, z, dx, dy, dz
+                b_sx, b_sy, b_sz = sx, sy, sz
+        if not (a_on or b_on):
+            return n, n_tiles
+        while a_on and b_on:
+            tile = np.int64(table[a_here >> 15])
+            if tile < 0:
+                tile = n_tiles
+                table[a_here >> 15] = n_tiles
+                tiles[n_tiles] = a_here >> 15
+                n_tiles += 1
+            words[tile << 9 | (a_here >> 6) & 511] |= one << (a_here & 63)
+            touched[tile << 6 | (a_here >> 9) & 63] = 1
+            tile = np.int64(table[b_here >> 15])
+            if tile < 0:
+                tile = n_tiles
+                table[b_here >> 15] = n_tiles
+                tiles[n_tiles] = b_here >> 15
+                n_tiles += 1
+            words[tile << 9 | (b_here >> 6) & 511] |= one << (b_here & 63)
+            touched[tile << 6 | (b_here >> 9) & 63] = 1
+            a_here, a_x, a_y, a_z = _advance(
+                a_here, a_x, a_y, a_z, a_dx, a_dy, a_dz, a_sx, a_sy, a_sz, mx, my, mz
+            )
+            b_here, b_x, b_y, b_z = _advance(
+                b_here, b_x, b_y, b_z, b_dx, b_dy, b_dz, b_sx, b_sy, b_sz, mx, my, mz
+            )
+            a_on = (a_here != a_end) & (not min(min(a_x, a_y), a_z) > a_length)
+            b_on = (b_here != b_end) & (not min(min(b_x, b_y), b_z) > b_length)
+        if n < last and not short:
+            continue
+        while a_on:
+            tile = np.int64(table[a_here >> 15])
+            if tile < 0:
+                tile = n_tiles
+                table[a_here >> 15] = n_tiles
+                tiles[n_tiles] = a_here >> 15
+                n_tiles += 1
+            words[tile << 9 | (a_here >> 6) & 511] |= one << (a_here & 63)
+            touched[tile << 6 | (a_here >> 9) & 63] = 1
+            a_here, a_x, a_y, a_z = _advance(
+                a_here, a_x, a_y, a_z, a_dx, a_dy, a_dz, a_sx, a_sy, a_sz, mx, my, mz
+            )
+            a_on = (a_here != a_end) & (not min(min(a_x, a_y), a_z) > a_length)
+        while b_on:
+            tile = np.int64(table[b_here >> 15])
+            if tile < 0:
+                tile = n_tiles
+                table[b_here >> 15] = n_tiles
+                tiles[n_tiles] = b_here >> 15
+                n_tiles += 1
+            words[tile << 9 | (b_here >> 6) & 511] |= one << (b_here & 63)
+            touched[tile << 6 | (b_here >> 9) & 63] = 1
+            b_here, b_x, b_y, b_z = _advance(
+                b_here, b_x, b_y, b_z, b_dx, b_dy, b_dz, b_sx, b_sy, b_sz, mx, my, mz
+            )
+            b_on = (b_here != b_end) & (not min(min(b_x, b_y), b_z) > b_length)
 
 
 @numba.njit(cache=True)  # type: ignore[misc]

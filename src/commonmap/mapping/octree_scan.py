@@ -53,14 +53,22 @@ class ScanBits:
         """Set the bits of all rays; return the address of each hit, or -1."""
         at = np.empty(len(ends), np.int64)
         done = 0
-        while True:
-            done, self.n_tiles = kernels.trace(
-                done, starts, ends, state, resolution, self.low, self.bits, self.table, self.tiles,
-                self.n_tiles, self.words, self.touched, at,
+        while done < len(ends):
+            done, self.n_tiles = kernels.mark_ends(
+                done, ends, state, resolution, self.low, self.bits, self.table, self.tiles,
+                self.n_tiles, self.touched, at,
             )  # fmt: skip
-            if done == len(ends):
-                return at
-            self._add_tiles(max(64, len(self.tiles) // 2))
+            if done < len(ends):
+                self._add_tiles(max(64, len(self.tiles) // 2))
+        done = 0
+        while done < len(ends):
+            done, self.n_tiles = kernels.trace(
+                done, len(ends), starts, ends, state, resolution, self.low, self.bits, self.table,
+                self.tiles, self.n_tiles, self.words, self.touched,
+            )  # fmt: skip
+            if done < len(ends):
+                self._add_tiles(max(64, len(self.tiles) // 2))
+        return at
 
     def touched_cubes(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the touched cubes, and the Morton code of the block behind each."""
