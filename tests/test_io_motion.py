@@ -145,10 +145,11 @@ def test_the_layout_is_that_of_kitti(tmp_path: Path) -> None:
 def test_points_that_are_not_finite_are_left_out(tmp_path: Path) -> None:
     scan = some_scans(1)[0]
     scan.xyz[2] = np.nan
+    scan.time[4] = np.nan
     write_scans(tmp_path / "log", [scan])
     (back,) = iter_scans(tmp_path / "log")
-    np.testing.assert_array_equal(back.xyz, np.delete(scan.xyz, 2, axis=0))
-    np.testing.assert_array_equal(back.ring, np.delete(scan.ring, 2))
+    np.testing.assert_array_equal(back.xyz, np.delete(scan.xyz, [2, 4], axis=0))
+    np.testing.assert_array_equal(back.ring, np.delete(scan.ring, [2, 4]))
 
 
 def test_a_fault_within_the_scans_leaves_nothing(tmp_path: Path) -> None:

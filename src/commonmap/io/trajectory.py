@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from commonmap.errors import InputError
-from commonmap.frames import quaternion
 from commonmap.io.atomic import writing
 from commonmap.io.source import PathLike, is_text, look, looks_like, parsing
 from commonmap.types import Float64s, Trajectory
@@ -67,6 +66,8 @@ def write_trajectory(path: PathLike, trajectory: Trajectory) -> None:
         )
     if not (np.isfinite(time).all() and np.isfinite(T).all() and (np.diff(time) > 0).all()):
         raise InputError(f"{path}: a trajectory needs rising times and finite motions")
+    from commonmap.frames import quaternion
+
     table = np.concatenate([time[:, None], T[:, :3, 3], quaternion(T)], axis=1) + 0.0
     with writing(path) as part, open(part, "w", encoding="ascii", newline="\n") as file:
         file.write("# timestamp x y z qx qy qz qw\n")
