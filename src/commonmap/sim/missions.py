@@ -170,7 +170,8 @@ def flight_level(world: World, area: Area, height: float) -> float:
     below = area.holds(xy)
     if not below.any():
         raise InputError("the drone's area lies outside the world")
-    ground = float(np.median(world.height(xy[below])))
+    nodes = slice(0, world.terrain.z.size)  # the vertices of the ground come first
+    ground = float(np.median(world.vertices[nodes, 2][below[nodes]]))
     return max(ground + height, float(world.vertices[below, 2].max()) + 3.0)
 
 

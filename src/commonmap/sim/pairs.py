@@ -125,17 +125,20 @@ def simulate_pair(
     )  # fmt: skip
 
     # 2. what each lidar measures, in the world's frame
+    caster = RayCaster(world)
     base = _survey(
-        world, flight, find_lidar(lidar_target), 2.0, rng, max(1, azimuth_decimation // 2)
+        caster, flight, find_lidar(lidar_target), 2.0, rng, max(1, azimuth_decimation // 2)
     )
-    draft = _survey(visited, ground, find_lidar(lidar_source), 0.8, rng, azimuth_decimation)
-    base = _keep(base, _within(base, 100.0) & base_area.holds(_placed(base, flight)[:, :2]))
+    if visited is not world:
+        caster = RayCaster(visited)
+    draft = _survey(caster, ground, find_lidar(lidar_source), 0.8, rng, azimuth_decimation)
     draft = _keep(draft, _within(draft, max_range))
     base_true, draft_true = _placed(base, flight), _placed(draft, ground)
 
     # 3. the border of the flight, so that the overlap is as asked
-    border = _border(base_true, draft_true, overlap, draft_area)
-    kept = before_border(base_true, border)
+    kept = base_area.holds(base_true[:, :2])
+    border = _border(base_true[kept], draft_true, overlap, draft_area)
+    kept &= before_border(base_true, border)
     base, base_true = _keep(base, kept), base_true[kept]
     base, base_true = _thin(base, base_true, max_points, rng)
     draft, draft_true = _thin(draft, draft_true, max_points, rng)
@@ -184,19 +187,27 @@ def fit_motion(points_a: Float64s, points_b: Float64s) -> Float64s:
 
 def measure_overlap(target: Float64s, source: Float64s, *, cell: float = OVERLAP_CELL) -> float:
     """Return the share of the cells seen by the source (N, 3) that the target saw, same frame."""
-    seen_target, seen_source = _cells(target, cell), _cells(source, cell)
-    return float(np.isin(seen_source, seen_target).mean())
+    seen, shared = _seen_cells(target, source, cell)
+    return len(shared) / len(seen)
 
 
-def _cells(points: Float64s, cell: float) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-    """Return the numbers of the cells that hold points, each once."""
-    at = np.floor(points[:, :2] / cell).astype(np.int64) + 2**20
-    return np.unique(at[:, 0] * 2**21 + at[:, 1])
+def _seen_cells(target: Float64s, source: Float64s, cell: float) -> tuple[Float64s, Float64s]:
+    """Return the middles of the cells that the source saw (N, 2), and of those that both saw."""
+    at_target, at_source = (np.floor(p[:, :2] / cell).astype(np.int64) for p in (target, source))
+    low, high = at_source.min(axis=0), at_source.max(axis=0) + 1
+    by_source, by_target = np.zeros((2, *(high - low)), dtype=bool)
+    by_source[tuple((at_source - low).T)] = True
+    inside = ((at_target >= low) & (at_target < high)).all(axis=1)
+    by_target[tuple((at_target[inside] - low).T)] = True
+    return (
+        (np.argwhere(by_source) + low + 0.5) * cell,
+        (np.argwhere(by_source & by_target) + low + 0.5) * cell,
+    )
 
 
 def _survey(
-    world: World, mission: Mission, lidar: LidarModel, spacing: float, rng: np.random.Generator,
-    azimuth_decimation: int,
+    caster: RayCaster, mission: Mission, lidar: LidarModel, spacing: float,
+    rng: np.random.Generator, azimuth_decimation: int,
 ) -> Returns:  # fmt: skip
     """Return the returns of one turn every `spacing` metres of a mission."""
     last = mission.sensor.time[-1] - 1.0 / lidar.rate
@@ -204,9 +215,8 @@ def _survey(
     at = mission.sensor.time[np.searchsorted(mission.distance, stops)]
     stamps = np.unique(at[at <= last])
     return scan_world(
-        RayCaster(world), mission.sensor, lidar, stamps, rng=rng,
-        azimuth_decimation=azimuth_decimation,
-    )  # fmt: skip
+        caster, mission.sensor, lidar, stamps, rng=rng, azimuth_decimation=azimuth_decimation
+    )
 
 
 def _placed(returns: Returns, mission: Mission) -> Float64s:
@@ -251,15 +261,13 @@ def _border(base: Float64s, draft: Float64s, overlap: float, area: Area) -> Floa
     It runs across the way from the middle of the place to the draft's area, so that the base keeps
     the larger part. None where the base shares no more than asked anyway.
     """
-    cells = _cells(draft, OVERLAP_CELL)
-    both = cells[np.isin(cells, _cells(base, OVERLAP_CELL))]
-    n_asked = round(overlap * len(cells))
-    if len(both) <= n_asked:
+    seen, shared = _seen_cells(base, draft, OVERLAP_CELL)
+    n_asked = round(overlap * len(seen))
+    if len(shared) <= n_asked:
         return None
     away = np.array([area.x, area.y]) + 1e-9
     away /= np.linalg.norm(away)
-    centre = (np.stack([both // 2**21 - 2**20, both % 2**21 - 2**20], axis=1) + 0.5) * OVERLAP_CELL
-    return np.array([*away, np.sort(centre @ away)[n_asked]])
+    return np.array([*away, np.sort(shared @ away)[n_asked]])
 
 
 def _known(

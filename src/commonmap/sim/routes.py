@@ -36,7 +36,10 @@ def free_space(
     """
     n = int(np.ceil(world.size / cell))
     origin = np.full(2, -world.size / 2)
+    height = world.vertices[:, 2] - world.height(world.vertices[:, :2].astype(np.float64))
     things = world.faces[world.face_object != GROUND]
+    reach = height[things]  # a roof's triangle hangs high at all its corners, a wall's does not
+    things = things[(reach.max(axis=1) > low) & (reach.min(axis=1) < high)]
     points = _sample_triangles(world.vertices[things].astype(np.float64), 0.6 * cell)
     above = points[:, 2] - world.height(points[:, :2])
     points = points[(above > low) & (above < high)]
@@ -55,19 +58,24 @@ def free_space(
 
 
 def _sample_triangles(corners: Float64s, spacing: float) -> Float64s:
-    """Return points on triangles (F, 3, 3), at most `spacing` metres apart, (N, 3)."""
-    edges = corners[:, [1, 2, 0]] - corners
-    longest = np.sqrt((edges**2).sum(axis=2)).max(axis=1)
-    n = np.maximum(1, np.ceil(longest / spacing)).astype(int)
-    found = []
-    for k in np.unique(n):
-        i, j = np.nonzero(np.add.outer(np.arange(k + 1), np.arange(k + 1)) <= k)
-        u, v = (i / k)[:, None], (j / k)[:, None]
-        group = corners[n == k]
-        found.append(
-            (1 - u - v) * group[:, None, 0] + u * group[:, None, 1] + v * group[:, None, 2]
-        )
-    return np.concatenate([points.reshape(-1, 3) for points in found])
+    """Return points on triangles (F, 3, 3), at most `spacing` metres apart, (N, 3).
+
+    Rows run across from the tip to the shortest side, so that slivers cost little.
+    """
+    edge = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
+    first = np.argmin(edge, axis=1)
+    row = np.arange(len(corners))
+    a, b, tip = (corners[row, (first + k) % 3] for k in range(3))
+    n_rows = np.maximum(1, np.ceil(edge.max(axis=1) / spacing)).astype(int)
+    n_across = np.maximum(1, np.ceil(edge[row, first] / spacing)).astype(int)
+    found = [np.zeros((0, 3))]
+    for m, k in np.unique(np.stack([n_rows, n_across], axis=1), axis=0):
+        same = (n_rows == m) & (n_across == k)
+        t, s = np.meshgrid(np.arange(m + 1) / m, np.arange(k + 1) / k, indexing="ij")
+        t, s = t.reshape(-1, 1), s.reshape(-1, 1)
+        start, side, end = a[same, None], (b - a)[same, None], tip[same, None]
+        found.append(((1 - t) * (start + s * side) + t * end).reshape(-1, 3))
+    return np.concatenate(found)
 
 
 def plan_route(

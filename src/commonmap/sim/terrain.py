@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from commonmap.sim.mesh import Mesh, make_mesh
 from commonmap.types import Float32s, Float64s
@@ -27,16 +28,8 @@ class Terrain:
 
         Points beyond the border take the height of the border.
         """
-        nx, ny = self.z.shape
-        u, v = ((np.asarray(xy, dtype=np.float64) - self.origin) / self.cell).T
-        u, v = np.clip(u, 0, nx - 1.000001), np.clip(v, 0, ny - 1.000001)
-        i, j = u.astype(np.intp), v.astype(np.intp)
-        u, v = u - i, v - j
-        z00, z10 = self.z[i, j].astype(np.float64), self.z[i + 1, j]
-        z01, z11 = self.z[i, j + 1], self.z[i + 1, j + 1]
-        below = z00 + u * (z10 - z00) + v * (z11 - z10)
-        above = z00 + v * (z01 - z00) + u * (z11 - z01)
-        return np.asarray(np.where(u >= v, below, above), dtype=np.float64)
+        points = np.ascontiguousarray(xy, dtype=np.float64)
+        return _height_kernel(points, self.origin, self.cell, self.z)
 
     def mesh(self, material: str) -> Mesh:
         """Return the ground as triangles, split along the diagonal of rising x and y."""
@@ -48,6 +41,25 @@ class Terrain:
         upper = np.stack([node, node + ny + 1, node + 1], axis=-1)
         faces = np.concatenate([lower.reshape(-1, 3), upper.reshape(-1, 3)])
         return make_mesh(np.stack([x, y, self.z], axis=-1), faces, material)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _height_kernel(xy: Float64s, origin: Float64s, cell: float, z: Float32s) -> Float64s:
+    nx, ny = z.shape
+    height = np.empty(len(xy))
+    for k in range(len(xy)):
+        u = min(max((xy[k, 0] - origin[0]) / cell, 0.0), nx - 1.000001)
+        v = min(max((xy[k, 1] - origin[1]) / cell, 0.0), ny - 1.000001)
+        i, j = int(u), int(v)
+        u, v = u - i, v - j
+        z00, z11 = float(z[i, j]), float(z[i + 1, j + 1])
+        if u >= v:
+            z10 = float(z[i + 1, j])
+            height[k] = z00 + u * (z10 - z00) + v * (z11 - z10)
+        else:
+            z01 = float(z[i, j + 1])
+            height[k] = z00 + v * (z01 - z00) + u * (z11 - z01)
+    return height
 
 
 def roll_terrain(
