@@ -16,8 +16,8 @@ from scipy import ndimage
 from commonmap.config import Config, MergeConfig
 from commonmap.errors import InputError
 from commonmap.frames import apply, from_rotation
-from commonmap.mapping.ground import Ground, find_ground
-from commonmap.mapping.height_map import choose_cell
+from commonmap.mapping.ground import Ground, find_ground, typical_spacing
+from commonmap.mapping.height_map import NICE_CELLS
 from commonmap.mapping.octree import Octree, octree_from_points
 from commonmap.mapping.points import points_of
 from commonmap.merging.octrees import MergedOctree, merge, resample
@@ -161,7 +161,8 @@ def choose_resolution(target: Map, source: Map, config: Config) -> float:
     """Return the edge in metres of a voxel of the common octree.
 
     In this order: `merge.resolution`; that of an octree among the inputs, the target's first;
-    `grid.resolution`; a size from the density of the two clouds.
+    `grid.resolution`; a round size at least three times as wide as the points of the sparser
+    cloud are apart, seen from above.
     """
     if config.merge.resolution is not None:
         return config.merge.resolution
@@ -170,7 +171,11 @@ def choose_resolution(target: Map, source: Map, config: Config) -> float:
             return map_.resolution
     if config.grid.resolution is not None:
         return config.grid.resolution
-    return choose_cell(points_of(target, "target"), points_of(source, "source"))
+    spacing = max(
+        typical_spacing(points_of(target, "target")), typical_spacing(points_of(source, "source"))
+    )
+    fitting = [cell for cell in NICE_CELLS if cell >= max(0.1, 2.99 * spacing)]
+    return fitting[0] if fitting else float(np.ceil(3.0 * spacing))
 
 
 def merge_octrees(
