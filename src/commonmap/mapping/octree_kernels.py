@@ -182,6 +182,8 @@ def _start(  # type: ignore[no-untyped-def]
     )
     dx, dy, dz = x1 - x0, y1 - y0, z1 - z0
     length = np.float32(np.sqrt(np.float64(dx * dx + dy * dy + dz * dz)))
+    if here == end:
+        length = np.float32(1.0)  # an empty ray may have none
     sx, tx, ddx = ray(x0, x1, kx, resolution, length)
     sy, ty, ddy = ray(y0, y1, ky, resolution, length)
     sz, tz, ddz = ray(z0, z1, kz, resolution, length)
