@@ -324,8 +324,9 @@ def _search(match: Match, centre: Float64s) -> str:
     rivals = list(match.rivals)
     if best is None and rivals:
         best = rivals.pop(0).T_target_source
-    marks = [] if best is None else [_mark(best, centre, "best", strong=True)]
-    marks += [_mark(r.T_target_source, centre, str(n)) for n, r in enumerate(rivals, start=1)]
+    first = 1 if match.T_target_source is not None else 2
+    marks = [_mark(r.T_target_source, centre, str(n)) for n, r in enumerate(rivals, start=first)]
+    marks = marks[::-1] + ([] if best is None else [_mark(best, centre, "best", strong=True)])
     picture = _cropped(picture)
     finite = picture.score[np.isfinite(picture.score)]
     low = float(finite.min()) if len(finite) else 0.0
@@ -400,7 +401,7 @@ def _settings(match: Match, config: Config, names: tuple[str, str]) -> str:
             "<h3>Transform</h3><p>Points of the draft become points of the base: "
             "p<sub>base</sub> = T p<sub>draft</sub>.</p>"
             f"<pre>{escape(tables.matrix_text(match.T_target_source))}</pre>"
-            f"<h3>For ROS 2</h3><pre>{escape(command)}</pre>"
+            f"<h3>For ROS 2</h3><pre class=command>{escape(command)}</pre>"
         )
     parts.append(
         "<h3>Configuration</h3><details><summary>All values, resolved"

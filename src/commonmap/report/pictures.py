@@ -191,7 +191,7 @@ def curve_figure(
     for tick in ticks:
         u = at(tick, low)[0]
         parts.append(
-            f'<text x="{u:.1f}" y="{top + h + 18:.1f}" text-anchor="middle">{tick:g}</text>'
+            f'<text x="{u:.1f}" y="{top + h + 18:.1f}" text-anchor="middle">{_tick(tick)}</text>'
         )
     parts.append(f'<line class="axis" x1="{left}" x2="{left + w}" y1="{top + h}" y2="{top + h}"/>')
     path = " ".join(

@@ -82,8 +82,8 @@ def to_json(value: object) -> str:
 
 
 def _plain(value: float) -> str:
-    """Return a number without exponent, with all digits that matter to a position in UTM."""
-    return f"{float(value):.12f}".rstrip("0").rstrip(".")
+    """Return a number without exponent, with the digits that tell it from its neighbours."""
+    return str(np.format_float_positional(float(value) + 0.0, trim="-"))
 
 
 def _strict(value: object) -> object:

@@ -1,0 +1,421 @@
+"""The commands. Each imports what it uses when it runs, so that `--help` answers at once.
+
+Exit codes: 0 done (a match: accepted), 2 bad input, 3 the match was refused, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+
+import typer
+
+from commonmap.errors import CommonmapError, InputError
+from commonmap.version import __version__
+
+if TYPE_CHECKING:
+    from commonmap.config import Config
+    from commonmap.types import Cloud, Leaves, Match
+
+USAGE_ERROR: Any = typer.BadParameter.__mro__[2]
+"""What click raises for a wrong command line; newer releases of typer bring their own click."""
+
+REFUSED = 3
+INTERRUPTED = 130
+
+app = typer.Typer(
+    name="commonmap",
+    help="One common map from what a drone's lidar and a ground robot's lidar saw of one place.",
+    epilog="Exit codes: 0 accepted or done, 2 bad input, 3 refused, 130 interrupted.",
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+Base = Annotated[
+    Path, typer.Argument(metavar="BASE", help="The map whose frame stays (the drone's).")
+]
+Draft = Annotated[Path, typer.Argument(metavar="DRAFT", help="The map to be placed (the robot's).")]
+Metric = Annotated[str | None, typer.Option(help="Similarity metric; see `commonmap metrics`.")]
+MaxHeight = Annotated[
+    float | None, typer.Option(help="Use only what is less than this above ground, metres.")
+]
+Resolution = Annotated[float | None, typer.Option(help="Cell and voxel size, metres.")]
+Level = Annotated[str | None, typer.Option(metavar="auto|off", help="Level maps without gravity.")]
+Seed = Annotated[int | None, typer.Option(help="Seed where chance enters.")]
+ConfigFile = Annotated[
+    Path | None,
+    typer.Option("--config", help="Configuration, .json or .toml; options win over it."),
+]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
+
+
+def main() -> NoReturn:
+    """Run the command line: a known error becomes one line on stderr and its exit code."""
+    signal.signal(signal.SIGTERM, _terminate)
+    try:
+        code = app(standalone_mode=False)
+        sys.stdout.flush()
+    except CommonmapError as error:
+        _fail(str(error), error.exit_code)
+    except USAGE_ERROR as error:
+        context = getattr(error, "ctx", None)
+        hint = f" (see `{context.command_path} --help`)" if context is not None else ""
+        _fail(error.format_message().rstrip(".") + hint, 2)
+    except (KeyboardInterrupt, typer.Abort):
+        _fail("interrupted; nothing was written", INTERRUPTED)
+    except BrokenPipeError:
+        # Whoever read our output has gone: that is no error of ours
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+@app.callback(invoke_without_command=True)
+def _root(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version and end.")] = False,
+) -> None:
+    if version:
+        print(f"commonmap {__version__}")
+    elif context.invoked_subcommand is None:
+        print(context.get_help())
+
+
+@app.command("run")
+def run_command(
+    base: Base,
+    draft: Draft,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the results.")] = Path("out"),
+    metric: Metric = None,
+    max_height: MaxHeight = None,
+    resolution: Resolution = None,
+    level: Level = None,
+    seed: Seed = None,
+    config: ConfigFile = None,
+    quiet: Quiet = False,
+) -> int:
+    """Match two maps and, where the match is accepted, merge them: all results in one folder."""
+    settings = _settings(config, metric, max_height, resolution, level, seed)
+    from commonmap import cli_results, pipeline
+    from commonmap.cli_progress import telling
+
+    cli_results.check_folder(out)
+    with _notes(quiet), telling(quiet=quiet) as progress:
+        target, source = _read_both(base, draft, progress)
+        result = pipeline.run(target, source, config=settings, progress=progress)
+        progress("write the results")
+        with cli_results.results_folder(out) as part:
+            names = cli_results.write_run(
+                part, target=target, source=source, match=result.match, common=result.common,
+                config=settings, names=(base.name, draft.name),
+            )  # fmt: skip
+    if not quiet:
+        _say_match(result.match)
+        print(f"written: {out}/ ({', '.join(names)})")
+    return 0 if result.match.accepted else REFUSED
+
+
+@app.command("match")
+def match_command(
+    base: Base,
+    draft: Draft,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Where to write match.json; else to stdout.")
+    ] = None,
+    metric: Metric = None,
+    max_height: MaxHeight = None,
+    resolution: Resolution = None,
+    level: Level = None,
+    seed: Seed = None,
+    config: ConfigFile = None,
+    quiet: Quiet = False,
+) -> int:
+    """Find the pose of DRAFT in BASE's frame, with an honest yes or no."""
+    settings = _settings(config, metric, max_height, resolution, level, seed)
+    from commonmap import cli_results, pipeline
+    from commonmap.cli_progress import telling
+    from commonmap.report.pose import to_json
+
+    if out is not None:
+        cli_results.check_file(out)
+    with _notes(quiet), telling(quiet=quiet) as progress:
+        target, source = _read_both(base, draft, progress)
+        found = pipeline.match_maps(target, source, config=settings, progress=progress)
+    values = cli_results.match_to_dict(
+        found, config=settings, names=(base.name, draft.name),
+        n_points=(_size(target), _size(source)),
+    )  # fmt: skip
+    if out is None:
+        print(to_json(values), end="")
+    else:
+        cli_results.write_json(out, values)
+        if not quiet:
+            _say_match(found)
+            print(f"written: {out}")
+    return 0 if found.accepted else REFUSED
+
+
+@app.command("merge")
+def merge_command(
+    base: Base,
+    draft: Draft,
+    match: Annotated[Path, typer.Option("--match", help="match.json of `commonmap match`.")],
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="Common map: .ot .bt (octree) .ply .pcd .las .laz.")
+    ],
+    resolution: Resolution = None,
+    config: ConfigFile = None,
+    quiet: Quiet = False,
+) -> int:
+    """Merge two maps whose match is known into one file, in BASE's frame."""
+    settings = _settings(config, None, None, resolution, None, None)
+    from commonmap import cli_results, pipeline
+    from commonmap.cli_progress import telling
+    from commonmap.io.formats import find_writer, write_map
+
+    holds = find_writer(out).holds
+    cli_results.check_file(out)
+    T_target_source = cli_results.read_pose(match)
+    with _notes(quiet), telling(quiet=quiet) as progress:
+        target, source = _read_both(base, draft, progress)
+        common = pipeline.merge_maps(
+            target, source, T_target_source, config=settings, progress=progress
+        )
+        progress("write the common map")
+        write_map(out, common.leaves if holds == "octree" else common.cloud)
+    if not quiet:
+        if holds == "octree" and common.octree_origin.any():
+            print(
+                f"the octree's frame is moved to {common.octree_origin.tolist()} of the base, "
+                "whose coordinates are too large for an octree"
+            )
+        print(f"written: {out}")
+    return 0
+
+
+@app.command("demo")
+def demo_command(
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the results.")] = Path(
+        "demo-out"
+    ),
+    scene: Annotated[str, typer.Option(help="Kind of place to simulate.")] = "paper",
+    drift: Annotated[float, typer.Option(help="Error of the poses, share of the way.")] = 0.003,
+    metric: Metric = None,
+    max_height: MaxHeight = None,
+    resolution: Resolution = None,
+    seed: Seed = None,
+    config: ConfigFile = None,
+    quiet: Quiet = False,
+) -> int:
+    """Simulate two robots in one place, run the job on their maps, say how far from the truth."""
+    settings = _settings(config, metric, max_height, resolution, None, seed)
+    import numpy as np
+
+    from commonmap import cli_results, pipeline
+    from commonmap.cli_progress import telling
+    from commonmap.io.formats import write_map
+
+    cli_results.check_folder(out)
+    note = (
+        "Simulated: the maps are made with the robots' true poses and a drift of "
+        f"{100 * drift:g} % of the way, not yet with lidar odometry."
+    )
+    with _notes(quiet), telling(quiet=quiet) as progress:
+        shown = pipeline.demo(
+            rng=np.random.default_rng(settings.seed), scene=scene, drift=drift, config=settings,
+            progress=progress,
+        )  # fmt: skip
+        error = None if shown.metres is None else (shown.metres, shown.radians or 0.0)
+        progress("write the results")
+        with cli_results.results_folder(out) as part:
+            write_map(part / "base.laz", shown.target)
+            write_map(part / "draft.laz", shown.source)
+            truth = {"T_target_source": shown.T_target_source, "seed": settings.seed}
+            cli_results.write_json(part / "truth.json", {**truth, "scene": scene, "drift": drift})
+            cli_results.write_run(
+                part, target=shown.target, source=shown.source, match=shown.result.match,
+                common=shown.result.common, config=settings,
+                names=("base.laz (drone)", "draft.laz (ground robot)"), notes=[note], error=error,
+            )  # fmt: skip
+    if not quiet:
+        print(note)
+        _say_match(shown.result.match)
+        if error is not None:
+            print(f"from the truth: {error[0]:.3f} m, {math.degrees(error[1]):.3f} degrees")
+        print(f"report: {(out / 'report.html').resolve()}")
+    return 0 if shown.result.match.accepted else REFUSED
+
+
+@app.command("simulate")
+def simulate_command(
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for logs, poses and truth.")],
+    scene: Annotated[str, typer.Option(help="Kind of place to simulate.")] = "paper",
+    overlap: Annotated[float, typer.Option(help="Share of the draft that the base covers.")] = 1.0,
+    drift: Annotated[float, typer.Option(help="Error of the poses, share of the way.")] = 0.003,
+    tilt_deg: Annotated[float, typer.Option(help="Tilt of the draft's frame, degrees.")] = 0.0,
+    change: Annotated[float, typer.Option(help="Share of things moved between visits.")] = 0.0,
+    seed: Seed = None,
+    quiet: Quiet = False,
+) -> int:
+    """Simulate a drone and a ground robot in one place and write what they recorded."""
+    settings = _settings(None, None, None, None, None, seed)
+    import numpy as np
+
+    from commonmap.cli_progress import telling
+    from commonmap.sim.simulate import write_simulation
+
+    with _notes(quiet), telling(quiet=quiet) as progress:
+        pair = write_simulation(
+            out, scene, np.random.default_rng(settings.seed), overlap=overlap, drift=drift,
+            tilt=math.radians(tilt_deg), change=change, progress=progress,
+        )  # fmt: skip
+    if not quiet:
+        print(f"overlap: {100 * pair.overlap:.0f} % of the draft")
+        print(f"written: {out}/ (uav, ugv, truth.json)")
+    return 0
+
+
+@app.command("info")
+def info_command(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A cloud, an octree or scans.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    quiet: Quiet = False,
+) -> int:
+    """Say what is in a file: kind, points, extent, resolution, CRS, time span."""
+    from commonmap.io.describe import describe
+    from commonmap.report.pose import to_json
+
+    with _notes(quiet):
+        values = describe(file)
+    if as_json:
+        print(to_json(values), end="")
+        return 0
+    width = max(len(name) for name in values)
+    for name, value in values.items():
+        print(f"{name.replace('_', ' '):<{width}}  {_in_words(value)}")
+    return 0
+
+
+@app.command("metrics")
+def metrics_command() -> int:
+    """List the similarity metrics."""
+    from commonmap.metrics.table import METRICS
+
+    width = max(len(name) for name in METRICS)
+    for name, row in sorted(METRICS.items(), key=lambda item: item[0] != "evidence"):
+        better = "more is better" if row.maximise else "less is better"
+        default = ", the default" if name == "evidence" else ""
+        print(f"{name:<{width}}  {row.title} ({row.family}; {better}{default})")
+    return 0
+
+
+def _settings(
+    file: Path | None, metric: str | None, max_height: float | None, resolution: float | None,
+    level: str | None, seed: int | None,
+) -> Config:  # fmt: skip
+    """Return the configuration of a file with the options of the command line on top."""
+    from dataclasses import replace
+
+    from commonmap.config import Config, read_config
+
+    config = (read_config(file) if file is not None else Config()).with_values(
+        grid={"resolution": resolution, "max_height": max_height},
+        level={"mode": level},
+        search={"metric": metric},
+    )
+    if metric is not None:
+        from commonmap.metrics.table import find_metric
+
+        find_metric(metric)
+    return config if seed is None else replace(config, seed=seed)
+
+
+def _read_both(base: Path, draft: Path, progress: Any) -> tuple[Cloud | Leaves, Cloud | Leaves]:
+    from commonmap.io.formats import read_map
+
+    for path in (base, draft):
+        if not path.exists():
+            raise InputError(f"there is no file {path}")
+    progress(f"read {base.name}")
+    target = read_map(base)
+    progress(f"read {draft.name}")
+    return target, read_map(draft)
+
+
+def _say_match(match: Match) -> None:
+    from commonmap.report.pose import pose_figures, sigma_figures
+
+    print(match.reason)
+    if match.T_target_source is None:
+        return
+    pose = pose_figures(match.T_target_source)
+    print(f"draft in base: x {pose.x:.3f} m, y {pose.y:.3f} m, z {pose.z:.3f} m")
+    print(
+        f"  yaw {pose.yaw_deg:.3f}, pitch {pose.pitch_deg:.3f}, roll {pose.roll_deg:.3f} degrees; "
+        f"confidence {math.floor(1000 * match.confidence) / 10:.1f} %, "
+        f"overlap {100 * match.overlap:.0f} %"
+    )
+    if match.covariance is not None:
+        s = sigma_figures(match.covariance)
+        print(
+            f"  one sigma: {s.x:.3f}, {s.y:.3f}, {s.z:.3f} m; "
+            f"yaw {s.yaw_deg:.3f}, pitch {s.pitch_deg:.3f}, roll {s.roll_deg:.3f} degrees"
+        )
+
+
+def _in_words(value: Any) -> str:
+    if value is None:
+        return "none"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int):
+        return f"{value:,}".replace(",", " ")
+    if isinstance(value, float):
+        return f"{value:.6g}" if abs(value) < 1e5 else f"{value:.3f}"
+    if isinstance(value, list):
+        return ", ".join(_in_words(item) for item in value)
+    return str(value)
+
+
+def _size(map_: Cloud | Leaves) -> int:
+    from commonmap.types import Cloud
+
+    return len(map_.xyz) if isinstance(map_, Cloud) else len(map_.keys)
+
+
+@contextmanager
+def _notes(quiet: bool) -> Iterator[None]:
+    """Print what readers note about a file (points left out, units) as lines on stderr."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("note: %(message)s"))
+    logger = logging.getLogger("commonmap")
+    handler.setLevel(logging.ERROR if quiet else logging.INFO)
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+
+
+def _fail(message: str, code: int) -> NoReturn:
+    line = " ".join(message.split())
+    print(f"commonmap: {line}", file=sys.stderr)
+    sys.exit(code)
+
+
+def _terminate(signum: int, frame: FrameType | None) -> None:
+    """Turn a request to end into an exception, so that unfinished files are cleared away."""
+    raise KeyboardInterrupt
+
+
+if __name__ == "__main__":
+    main()

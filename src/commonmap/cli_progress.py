@@ -1,0 +1,57 @@
+"""How a command says where it is: a moving line on a terminal, else plain lines, or nothing."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from commonmap.types import Progress, no_progress
+
+
+@contextmanager
+def telling(*, quiet: bool) -> Iterator[Progress]:
+    """Yield the progress callback for this terminal; it writes to stderr only."""
+    if quiet:
+        yield no_progress
+    elif sys.stderr.isatty():
+        with _moving() as progress:
+            yield progress
+    else:
+        yield _Lines()
+
+
+class _Lines:
+    """A line for each new step, with the seconds since the start."""
+
+    def __init__(self) -> None:
+        self.start = time.perf_counter()
+        self.step = ""
+
+    def __call__(self, step: str, share: float = 0.0) -> None:
+        if step != self.step:
+            self.step = step
+            seconds = time.perf_counter() - self.start
+            print(f"{seconds:7.1f} s  {step}", file=sys.stderr, flush=True)
+
+
+@contextmanager
+def _moving() -> Iterator[Progress]:
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bars
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=30),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeElapsedColumn(),
+    )
+    with Bars(*columns, console=Console(stderr=True), transient=True) as bars:
+        task = bars.add_task("start", total=1.0)
+
+        def tell(step: str, share: float = 0.0) -> None:
+            bars.update(task, description=step, completed=share)
+
+        yield tell
