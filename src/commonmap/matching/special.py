@@ -106,6 +106,8 @@ def _range(g: Any, counted: Array) -> tuple[float, float]:
     """Return the least and the largest g over the counted poses."""
     if getattr(g, "ndim", 0) == 0:
         return float(g), float(g)
+    if not bool(counted.any()):
+        return 0.0, 0.0
     xp_min, xp_max = np.where(counted, g, np.inf).min(), np.where(counted, g, -np.inf).max()
     return float(xp_min), float(xp_max)
 
