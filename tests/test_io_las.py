@@ -338,6 +338,17 @@ def test_fields_of_the_header_that_cannot_be(
         read_cloud(path)
 
 
+def test_a_laszip_record_of_another_point_format(tmp_path: Path) -> None:
+    path = write_with_laspy(tmp_path / "map.laz", point_format=10)
+    data = bytearray(path.read_bytes())
+    items = struct.pack("<9H", 10, 30, 3, 12, 8, 3, 13, 29, 3)
+    at = data.index(items)
+    data[at : at + 18] = struct.pack("<9H", 10, 30, 3, 12, 8, 3, 12, 29, 3)
+    path.write_bytes(data)  # a decoder would look for layers where there are none
+    with pytest.raises(InputError, match="does not describe points of format 10 with 67 bytes"):
+        read_cloud(path)
+
+
 def test_layers_of_a_chunk_that_outgrow_it(tmp_path: Path) -> None:
     path = write_with_laspy(tmp_path / "map.laz")
     data = bytearray(path.read_bytes())

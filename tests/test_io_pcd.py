@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from commonmap.errors import EmptyMapError, InputError
@@ -117,6 +117,7 @@ def test_lzf_streams_that_are_damaged(packed: bytes, n: int) -> None:
         decompress(np.frombuffer(packed, dtype=np.uint8), n)
 
 
+@settings(deadline=None)
 @given(st.lists(st.sampled_from([b"a", b"bb", b"abcabcabc", bytes(300), b"\x01\xff"]), max_size=20))
 def test_lzf_brings_back_what_was_packed(pieces: list[bytes]) -> None:
     data = b"".join(pieces)

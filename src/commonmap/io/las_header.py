@@ -15,6 +15,16 @@ from commonmap.errors import EmptyMapError, InputError
 RECORD_BYTES = {0: 20, 1: 28, 2: 26, 3: 34, 4: 57, 5: 63, 6: 30, 7: 36, 8: 38, 9: 59, 10: 67}
 """Smallest record of each point format, bytes."""
 
+_CORE, _TIME, _RGB, _WAVE = (6, 20), (7, 8), (8, 6), (9, 29)
+_CORE14, _RGB14, _NIR14, _WAVE14 = (10, 30), (11, 6), (12, 8), (13, 29)
+ITEMS: dict[int, tuple[tuple[int, int], ...]] = {
+    0: (_CORE,), 1: (_CORE, _TIME), 2: (_CORE, _RGB), 3: (_CORE, _TIME, _RGB),
+    4: (_CORE, _TIME, _WAVE), 5: (_CORE, _TIME, _RGB, _WAVE),
+    6: (_CORE14,), 7: (_CORE14, _RGB14), 8: (_CORE14, _NIR14), 9: (_CORE14, _WAVE14),
+    10: (_CORE14, _NIR14, _WAVE14),
+}  # fmt: skip
+"""Type and bytes of the items of each point format in a LASzip record."""
+
 LAYERS = {6: 9, 7: 10, 8: 11, 9: 10, 10: 12}
 """Compressed layers of a LAZ chunk of each layered point format, without extra bytes."""
 
@@ -187,19 +197,18 @@ def _check_laz(file: BinaryIO, path: Path, size: int, info: LasInfo, laszip: byt
     if len(laszip) < 34:
         raise InputError(f"{path} is damaged: its LASzip record has {len(laszip)} bytes")
     compressor, coder = struct.unpack_from("<HH", laszip, 0)
-    chunk_size, n_items = (
-        struct.unpack_from("<I", laszip, 12)[0],
-        struct.unpack_from("<H", laszip, 32)[0],
-    )
-    item_bytes = sum(
-        struct.unpack_from("<H", laszip, 36 + 6 * i)[0]
+    (chunk_size,) = struct.unpack_from("<I", laszip, 12)
+    (n_items,) = struct.unpack_from("<H", laszip, 32)
+    items = [
+        struct.unpack_from("<HH", laszip, 34 + 6 * i)
         for i in range(n_items)
-        if 38 + 6 * i <= len(laszip)
-    )
-    if compressor not in (1, 2, 3) or coder != 0 or item_bytes != info.record_bytes:
+        if 40 + 6 * i <= len(laszip)
+    ]
+    layered = info.point_format >= 6
+    if coder != 0 or compressor not in ((3,) if layered else (1, 2)) or items != _items(info):
         raise InputError(
-            f"{path} is damaged: its LASzip record describes points of {item_bytes} bytes, "
-            f"its header of {info.record_bytes}"
+            f"{path} is damaged: its LASzip record does not describe points of format "
+            f"{info.point_format} with {info.record_bytes} bytes"
         )
     if compressor == 1:  # pointwise: one stream, no chunks
         return info
@@ -219,6 +228,13 @@ def _check_laz(file: BinaryIO, path: Path, size: int, info: LasInfo, laszip: byt
     if info.point_format in LAYERS:
         _check_layers(file, path, info, chunks, None if variable else chunk_size)
     return LasInfo(**{**info.__dict__, "chunk_size": None if variable else chunk_size})
+
+
+def _items(info: LasInfo) -> list[tuple[int, int]]:
+    """Return type and bytes of the parts into which LASzip takes a point of this format."""
+    items = list(ITEMS[info.point_format])
+    extra = info.record_bytes - sum(n_bytes for _, n_bytes in items)
+    return [*items, (14 if info.point_format >= 6 else 0, extra)] if extra else items
 
 
 def _chunk_table(
