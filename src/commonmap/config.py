@@ -61,7 +61,7 @@ class SearchConfig:
     metric: str = "evidence"
     normalise: Literal["overlap", "map", "off"] = "overlap"
     floor: float = 0.05
-    min_overlap: float = 0.25
+    min_overlap: float = 0.1
     n_rivals: int = 5
 
     def __post_init__(self) -> None:

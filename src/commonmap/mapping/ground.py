@@ -37,8 +37,9 @@ class Ground:
     seen: Bools
 
     def height_at(self, xy: Float64s) -> Float64s:
-        """Return the ground's z at (N, 2) positions, bilinear, constant beyond the outer centres."""
-        return _bilinear(self.z, self.origin, self.cell, np.ascontiguousarray(xy, dtype=np.float64))
+        """Return the ground's z at (N, 2) positions, bilinear, constant past the outer centres."""
+        position = np.ascontiguousarray(xy, dtype=np.float64)
+        return np.asarray(_bilinear(self.z, self.origin, self.cell, position))
 
 
 def find_ground(xyz: Float64s, *, cell: float | None = None) -> Ground:

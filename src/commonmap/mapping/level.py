@@ -57,7 +57,7 @@ def find_level(xyz: Float64s) -> Levelling:
     centred = xyz - np.median(xyz, axis=0)
 
     # Roughly up: the map's own z, unless another direction has ground under everything
-    points, normals = _patches(centred, 30_000)
+    points, normals = _patches(centred[:: len(centred) // 500_000 + 1], 15_000)
     up, own = (
         _rough_up(points, normals) if len(points) >= 100 else (np.array([0.0, 0.0, 1.0]), True)
     )
@@ -89,7 +89,7 @@ def find_level(xyz: Float64s) -> Levelling:
 
 
 def _standing(xyz: Float64s) -> Float64s:
-    """Return one point per voxel of what stands over half a metre above ground, at most 80,000."""
+    """Return one point per voxel of what stands over half a metre above ground, at most 60,000."""
     ground = find_ground(xyz)
     above = xyz[xyz[:, 2] - ground.height_at(xyz[:, :2]) > 0.5]
     if len(above) == 0:
@@ -98,7 +98,7 @@ def _standing(xyz: Float64s) -> Float64s:
     span = key.max(axis=0) + 1
     _, first = np.unique((key[:, 0] * span[1] + key[:, 1]) * span[2] + key[:, 2], return_index=True)
     thin = above[np.sort(first)]
-    return np.ascontiguousarray(thin[:: len(thin) // 80_000 + 1])
+    return np.ascontiguousarray(thin[:: len(thin) // 60_000 + 1])
 
 
 def _sharpest(
@@ -169,7 +169,7 @@ def _patches(xyz: Float64s, n_most: int) -> tuple[Float64s, Float64s]:
         _, first = np.unique(key, axis=0, return_index=True) if len(key) < 400_000 else (
             None, np.arange(0, len(key), len(key) // 400_000 + 1)
         )  # fmt: skip
-        if len(first) <= 250_000:
+        if len(first) <= 150_000:
             break
         voxel *= 1.4
         key = np.floor(xyz / voxel).astype(np.int64)
@@ -187,14 +187,14 @@ def _patches(xyz: Float64s, n_most: int) -> tuple[Float64s, Float64s]:
 
 
 def _rough_up(points: Float64s, normals: Float64s) -> tuple[Float64s, bool]:
-    """Return (up, whether it is the map's own z), by how much ground each hypothesis finds below."""
+    """Return (up, whether it is the map's own z): the hypothesis with the most ground below it."""
     own = np.array([0.0, 0.0, 1.0])
     best, best_share = own, 1.5 * _ground_share(points, normals, own)
     rest = normals
     for _ in range(4):
         if len(rest) < 50:
             break
-        sample = rest[:: max(1, len(rest) // 400)]
+        sample = rest[:: max(1, len(rest) // 200)]
         votes = (np.abs(sample @ rest.T) > math.cos(math.radians(12.0))).sum(axis=1)
         peak = sample[int(np.argmax(votes))]
         rest = rest[np.abs(rest @ peak) < math.cos(math.radians(25.0))]

@@ -133,7 +133,7 @@ class Spectra:
 
 
 def transform_target(grid: SlabGrid, source_shape: tuple[int, int], *, workers: int) -> Spectra:
-    """Return the target's spectra, padded so that no shift of a source of that shape wraps round."""
+    """Return the target's spectra, padded so that no shift of such a source wraps round."""
     size = [
         fft.next_fast_len(t + s - 1, real=True)
         for t, s in zip(grid.shape, source_shape, strict=True)

@@ -143,7 +143,7 @@ def prepare(item: Cloud | Leaves | Float64s, name: str, config: Config) -> Prepa
         )
     if float(extent.max()) > 100_000:
         raise InputError(
-            f"the {name} spans {extent.max() / 1000:.0f} km; coordinates must be metres of one place"
+            f"the {name} spans {extent.max() / 1000:.0f} km; a map is of one place, in metres"
         )
     if config.level.mode == "off":
         levelling = no_levelling("levelling was turned off")

@@ -33,8 +33,9 @@ from commonmap.types import Float64s, Progress, no_progress
 
 @dataclass(frozen=True, eq=False)
 class Peaks:
-    """Planar poses, best first. pose: (M, 3) x, y, yaw of the source's centre in the target's frame.
+    """Planar poses, best first.
 
+    pose: (M, 3) x, y, yaw of the source's centre in the target's frame.
     score: (M,) evidence in nats. overlap: (M,) share of the source's known cells that meet known
     cells of the target. centre: (2,) the point of the source's frame that x, y place.
     per_yaw: (n_yaw, 2) yaw and the best score at it, of the coarse search.
@@ -96,7 +97,7 @@ def search(
     workers: int = 2,
     progress: Progress = no_progress,
 ) -> Peaks:
-    """Return the best separate poses of `source` on `target`, both on cells of half the finest cell.
+    """Return the best separate poses of `source` on `target`, both on half the finest cell.
 
     min_overlap: share of the source's known cells that must meet known cells of the target.
     mirrored: reflect the source (x -> -x about its centre) first; no true match exists then.
@@ -244,7 +245,7 @@ def _search_yaw(
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
 def local_maxima(score, n_peaks, above):  # type: ignore[no-untyped-def]
-    """Return the indices (n_peaks, 2) of the highest 3x3 local maxima over `above`, -1 where none."""
+    """Return the indices (n_peaks, 2) of the highest 3x3 local maxima over `above`, else -1."""
     index = np.full((n_peaks, 2), -1, np.int64)
     value = np.full(n_peaks, -np.inf)
     n_u, n_v = score.shape
