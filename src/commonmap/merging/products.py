@@ -161,8 +161,8 @@ def choose_resolution(target: Map, source: Map, config: Config) -> float:
     """Return the edge in metres of a voxel of the common octree.
 
     In this order: `merge.resolution`; that of an octree among the inputs, the target's first;
-    `grid.resolution`; a round size at least three times as wide as the points of the sparser
-    cloud are apart, seen from above.
+    `grid.resolution`; a round size of 0.2 m or more, at least twice as wide as the points of the
+    sparser cloud are apart, seen from above.
     """
     if config.merge.resolution is not None:
         return config.merge.resolution
@@ -174,8 +174,8 @@ def choose_resolution(target: Map, source: Map, config: Config) -> float:
     spacing = max(
         typical_spacing(points_of(target, "target")), typical_spacing(points_of(source, "source"))
     )
-    fitting = [cell for cell in NICE_CELLS if cell >= max(0.1, 2.99 * spacing)]
-    return fitting[0] if fitting else float(np.ceil(3.0 * spacing))
+    fitting = [cell for cell in NICE_CELLS if cell >= max(0.2, 2.0 * spacing)]
+    return fitting[0] if fitting else float(np.ceil(2.0 * spacing))
 
 
 def merge_octrees(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import warnings
 from dataclasses import dataclass
 
@@ -77,8 +78,10 @@ def static_transform_command(T_target_source: Float64s, frame_id: str, child_fra
 
 
 def to_json(value: object) -> str:
-    """Return strict JSON (a number that is not finite becomes null), indented by two."""
-    return json.dumps(_strict(value), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    """Return strict JSON (a number that is not finite becomes null), a row of numbers on a line."""
+    text = json.dumps(_strict(value), indent=2, allow_nan=False, ensure_ascii=False)
+    rows = re.sub(r'\[\n([^\[\]{}"]*)\n *\]', lambda m: f"[{' '.join(m[1].split())}]", text)
+    return rows + "\n"
 
 
 def _plain(value: float) -> str:

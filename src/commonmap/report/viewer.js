@@ -75,7 +75,7 @@
 
   // The camera looks at `focus` from `distance`, turned by `yaw` (about z) and `pitch` (above ground)
   const radius = Math.max(Math.hypot(meta.half[0], meta.half[1], meta.half[2]), 1e-3);
-  const home = { yaw: -0.9, pitch: 0.62, distance: 2.1 * radius, focus: [0, 0, -0.1 * meta.half[2]] };
+  const home = { yaw: -0.9, pitch: 0.62, distance: 1.9 * radius, focus: [0, 0, -0.1 * meta.half[2]] };
   let camera, mode = 0, size = 1, asked = false;
   function reset() { camera = { yaw: home.yaw, pitch: home.pitch, distance: home.distance, focus: home.focus.slice() }; draw(); }
 
