@@ -210,6 +210,12 @@ def test_drift_is_the_share_that_is_asked_and_smooth() -> None:
         off = np.linalg.norm((known.T_map_sensor - mission.sensor.T_map_sensor)[:, :3, 3], axis=1)
         assert np.abs(np.diff(off)).max() < 4 * share * 0.2  # a pose lasts 0.02 s, about 0.08 m
         R = known.T_map_sensor[:, :3, :3]
+        turned = [
+            angle(a.T @ b)
+            for a, b in zip(R[::500], mission.sensor.T_map_sensor[::500, :3, :3], strict=True)
+        ]
+        assert turned[0] == pytest.approx(0.0, abs=1e-7)
+        assert 0.01 * share < max(turned) < 5 * share
         np.testing.assert_allclose(
             R @ R.transpose(0, 2, 1), np.tile(np.eye(3), (len(R), 1, 1)), atol=1e-12
         )
@@ -286,6 +292,11 @@ def test_ground_robot_stays_clear_and_on_the_ground(world: World) -> None:
     assert mission.distance[-1] > 40.0
     above = body[:, 2, 3] - world.height(xy)
     assert np.abs(above).max() < 0.12
+    # the nose rises where the ground ahead is higher, the left side where the left is
+    for column, reach in ((0, 0.35), (1, 0.3)):
+        axis = body[:, :3, column]
+        rise = world.height(xy + reach * axis[:, :2]) - world.height(xy - reach * axis[:, :2])
+        assert np.corrcoef(axis[:, 2], rise)[0, 1] > 0.6
     up = mission.sensor.T_map_sensor[:, :3, 3] - body[:, :3, 3]
     np.testing.assert_allclose(np.linalg.norm(up, axis=1), 0.8, atol=1e-9)
     assert np.arccos(body[:, 2, 2]).max() < np.radians(25)
@@ -365,6 +376,21 @@ def test_simulation_as_files(tmp_path: Path) -> None:
         bins = sorted((folder / robot / "scans").glob("*.bin"))
         assert len(bins) >= 3
         _check_scan(bins[len(bins) // 2], known, cKDTree(cloud.xyz))
+
+    _check_border(folder, np.array(truth["border"]), pair.target_mission.sensor)
+
+
+def _check_border(folder: Path, border: Float64s, true: Trajectory) -> None:
+    """No scan of the drone reaches over the border of its map."""
+    seen = 0
+    for path in (folder / "uav" / "scans").glob("*.bin"):
+        xyz = np.fromfile(path, dtype="<f4").reshape(-1, 4)[:, :3]
+        rows = np.load(path.with_suffix(".npy"), allow_pickle=False)
+        T = true.T_map_sensor[np.searchsorted(true.time, rows["time"])]
+        placed = np.einsum("nij,nj->ni", T[:, :2, :3], xyz) + T[:, :2, 3]
+        assert (placed @ border[:2]).max() < border[2] + 0.2
+        seen += len(xyz)
+    assert seen > 1000
 
 
 def _check_scan(path: Path, known: Trajectory, tree: cKDTree) -> None:

@@ -89,6 +89,25 @@ def test_height_by_hand() -> None:
     np.testing.assert_allclose(terrain.height(outside), [0.0, 9.0], atol=1e-4)
 
 
+def test_tilted_things_lie_on_the_slope_and_others_stand_upright() -> None:
+    axis = np.arange(-15.0, 15.1, 0.5)
+    x, y = np.meshgrid(axis, axis, indexing="ij")
+    slope = Terrain(np.array([-15.0, -15.0]), 0.5, (0.2 * x - 0.1 * y).astype(np.float32))
+    normal = np.array([-0.2, 0.1, 1.0]) / np.linalg.norm([-0.2, 0.1, 1.0])
+    for kind, upright in (("container", False), ("lamp", True)):
+        site = Site("slope", 30.0, slope, "soil")
+        assert site.put(kind, OBJECTS[kind](np.random.default_rng(0)), 2.0, -3.0, 0.7)
+        world = site.finish()
+        (thing,) = world.objects
+        np.testing.assert_allclose(thing.centre, [2.0, -3.0, 0.7], atol=1e-5)
+        corners = world.vertices[slice(*thing.vertices)] - thing.centre
+        if upright:
+            assert np.hypot(*corners[:16, :2].T).max() < 0.1  # the post
+        else:
+            off = corners @ normal
+            np.testing.assert_allclose(np.unique(np.round(off, 3)), [-0.3, 2.59], atol=2e-3)
+
+
 def test_relief_and_slope_are_as_asked() -> None:
     rng = np.random.default_rng(5)
     spread = [

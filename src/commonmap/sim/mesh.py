@@ -201,8 +201,10 @@ def boulder(radius: float, rng: np.random.Generator, material: str) -> Mesh:
     lumps = rng.uniform(0.75, 1.2, (n_rings, sides))
     lumps[0] = lumps[0].mean()
     lumps[-1] = lumps[-1].mean()
+    across = np.sin(polar) * radius
+    across[[0, -1]] = 0.0  # the poles, exactly
     stone = lathe(
-        [(float(np.sin(p)) * radius, float(np.cos(p)) * radius) for p in polar],
+        list(zip(across.tolist(), (np.cos(polar) * radius).tolist(), strict=True)),
         material,
         sides=sides,
     )
