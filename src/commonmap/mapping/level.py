@@ -14,7 +14,6 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from scipy.spatial import cKDTree
 
 from commonmap.frames import apply, from_rotation, rotation_between
 from commonmap.mapping.ground import find_ground
@@ -57,10 +56,7 @@ def find_level(xyz: Float64s) -> Levelling:
     centred = xyz - np.median(xyz, axis=0)
 
     # Roughly up: the map's own z, unless another direction has ground under everything
-    points, normals = _patches(centred[:: len(centred) // 500_000 + 1], 15_000)
-    up, own = (
-        _rough_up(points, normals) if len(points) >= 100 else (np.array([0.0, 0.0, 1.0]), True)
-    )
+    up, own = _rough_up(centred)
     R_rough = rotation_between(up, (0.0, 0.0, 1.0))
 
     # Exactly up: the direction along which what stands above ground makes the sharpest plan
@@ -160,67 +156,71 @@ def _shared_pairs(xyz, a, b, cell):  # type: ignore[no-untyped-def]
     return pairs
 
 
-def _patches(xyz: Float64s, n_most: int) -> tuple[Float64s, Float64s]:
-    """Return centres and unit normals (n, 3) of locally flat patches of about 20 thinned points."""
-    extent = float(np.ptp(np.quantile(xyz, [0.02, 0.98], axis=0), axis=0).max())
-    voxel = max(0.05, extent / 1000.0)
-    key = np.floor(xyz / voxel).astype(np.int64)
-    for _ in range(6):
-        _, first = np.unique(key, axis=0, return_index=True) if len(key) < 400_000 else (
-            None, np.arange(0, len(key), len(key) // 400_000 + 1)
-        )  # fmt: skip
-        if len(first) <= 150_000:
-            break
-        voxel *= 1.4
-        key = np.floor(xyz / voxel).astype(np.int64)
-    thin = xyz[np.sort(first)]
-    seeds = thin[:: max(1, len(thin) // n_most)]
-    k = min(20, len(thin))
-    distance, index = cKDTree(thin, balanced_tree=False).query(seeds, k=k, workers=1)
-    near = thin[index] - seeds[:, None, :]
-    near -= near.mean(axis=1, keepdims=True)
-    values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near) / k)
-    flat = (values[:, 0] < 0.08 * values[:, 1]) & (distance[:, -1] < 40.0 * voxel)
-    # A patch along one line has no normal
-    flat &= values[:, 1] > 0.04 * values[:, 2]
-    return seeds[flat], vectors[flat, :, 0]
+def _rough_up(xyz: Float64s) -> tuple[Float64s, bool]:
+    """Return (up, whether it is the map's own z): the direction with smooth ground below it all.
 
-
-def _rough_up(points: Float64s, normals: Float64s) -> tuple[Float64s, bool]:
-    """Return (up, whether it is the map's own z): the hypothesis with the most ground below it."""
+    The map's own z stays unless another direction has half as much again.
+    """
+    points = np.ascontiguousarray(xyz[:: len(xyz) // 30_000 + 1])
+    low, high = np.quantile(points, [0.01, 0.99], axis=0)
+    size = max(float((high - low).max()) / 40.0, 0.25)
     own = np.array([0.0, 0.0, 1.0])
-    best, best_share = own, 1.5 * _ground_share(points, normals, own)
-    rest = normals
-    for _ in range(4):
-        if len(rest) < 50:
-            break
-        sample = rest[:: max(1, len(rest) // 200)]
-        votes = (np.abs(sample @ rest.T) > math.cos(math.radians(12.0))).sum(axis=1)
-        peak = sample[int(np.argmax(votes))]
-        rest = rest[np.abs(rest @ peak) < math.cos(math.radians(25.0))]
-        if abs(peak[2]) > math.cos(math.radians(25.0)):
+    own_share = _smooth_share(points, np.eye(3), size)
+    best, best_share = own, 1.5 * own_share
+    if own_share > 0.5:
+        return own, True
+    for up in _directions(200):
+        if up[2] > math.cos(math.radians(20.0)):
             continue
-        for up in (peak, -peak):
-            share = _ground_share(points, normals, up)
-            if share > best_share:
-                best, best_share = up, share
+        share = _smooth_share(points, rotation_between(up, (0.0, 0.0, 1.0)), size)
+        if share > best_share:
+            best, best_share = up, share
     return best, best is own
 
 
-def _ground_share(points: Float64s, normals: Float64s, up: Float64s) -> float:
-    """Return the share of columns along `up` whose lowest patch is ground: faces up, much above."""
-    turned = points @ rotation_between(up, (0.0, 0.0, 1.0)).T
-    extent = float(np.ptp(turned[:, :2], axis=0).max())
-    cell = max(extent / 40.0, 0.5)
-    ij = np.floor((turned[:, :2] - turned[:, :2].min(axis=0)) / cell).astype(np.int64)
-    column = ij[:, 0] * 4096 + ij[:, 1]
-    order = np.lexsort((turned[:, 2], column))
-    _, first = np.unique(column[order], return_index=True)
-    lowest = order[first]
-    faces = np.abs(normals[lowest] @ up) > math.cos(math.radians(35.0))
-    below_middle = turned[lowest, 2] <= np.median(turned[:, 2]) + 0.05 * extent
-    n_cells = (int(ij[:, 0].max()) + 1) * (int(ij[:, 1].max()) + 1)
-    return float(np.count_nonzero(faces & below_middle) / n_cells)
+def _directions(n: int) -> Float64s:
+    """Return n unit vectors evenly over the sphere (the golden spiral)."""
+    k = np.arange(n) + 0.5
+    z = 1.0 - 2.0 * k / n
+    turn = np.pi * (1.0 + math.sqrt(5.0)) * k
+    r = np.sqrt(1.0 - z**2)
+    return np.column_stack([r * np.cos(turn), r * np.sin(turn), z])
+
+
+@numba.njit(cache=True)  # type: ignore[misc]
+def _smooth_share(xyz, R, size):  # type: ignore[no-untyped-def]
+    """Return the share of columns whose lowest point goes on straight from neighbour to neighbour.
+
+    Straight: the second difference along x or y is under a fifth of the column's width, and the
+    slope under 40 degrees.
+    """
+    n = 256
+    z = np.full((n, n), np.inf)
+    for k in range(xyz.shape[0]):
+        x = R[0, 0] * xyz[k, 0] + R[0, 1] * xyz[k, 1] + R[0, 2] * xyz[k, 2]
+        y = R[1, 0] * xyz[k, 0] + R[1, 1] * xyz[k, 1] + R[1, 2] * xyz[k, 2]
+        h = R[2, 0] * xyz[k, 0] + R[2, 1] * xyz[k, 1] + R[2, 2] * xyz[k, 2]
+        i, j = int(np.floor(x / size)) + n // 2, int(np.floor(y / size)) + n // 2
+        if 0 <= i < n and 0 <= j < n and h < z[i, j]:
+            z[i, j] = h
+    columns, smooth = 0, 0
+    for i in range(1, n - 1):
+        for j in range(1, n - 1):
+            if not np.isfinite(z[i, j]):
+                continue
+            columns += 1
+            a = np.isfinite(z[i - 1, j]) and np.isfinite(z[i + 1, j])
+            b = np.isfinite(z[i, j - 1]) and np.isfinite(z[i, j + 1])
+            if (
+                a
+                and b
+                and abs(z[i - 1, j] - 2.0 * z[i, j] + z[i + 1, j]) < 0.2 * size
+                and abs(z[i, j - 1] - 2.0 * z[i, j] + z[i, j + 1]) < 0.2 * size
+                and abs(z[i + 1, j] - z[i - 1, j]) < 1.7 * size
+                and abs(z[i, j + 1] - z[i, j - 1]) < 1.7 * size
+            ):
+                smooth += 1
+    return smooth / max(columns, 1)
 
 
 def apply_level(levelling: Levelling, xyz: Float64s) -> Float64s:
