@@ -159,15 +159,15 @@ def _shared_pairs(xyz, a, b, cell):  # type: ignore[no-untyped-def]
 def _rough_up(xyz: Float64s) -> tuple[Float64s, bool]:
     """Return (up, whether it is the map's own z): the direction with smooth ground below it all.
 
-    The map's own z stays unless another direction has half as much again.
+    The map's own z stays unless another direction has twice as much of it.
     """
-    points = np.ascontiguousarray(xyz[:: len(xyz) // 30_000 + 1])
+    points = np.ascontiguousarray(xyz[:: len(xyz) // 300_000 + 1])
     low, high = np.quantile(points, [0.01, 0.99], axis=0)
     size = max(float((high - low).max()) / 40.0, 0.25)
     own = np.array([0.0, 0.0, 1.0])
     own_share = _smooth_share(points, np.eye(3), size)
-    best, best_share = own, 1.5 * own_share
-    if own_share > 0.5:
+    best, best_share = own, max(2.0 * own_share, 0.15)
+    if own_share > 0.4:
         return own, True
     for up in _directions(200):
         if up[2] > math.cos(math.radians(20.0)):
