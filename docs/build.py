@@ -1,4 +1,4 @@
-"""Write the pages that are made from tables, and check that every link between pages leads somewhere.
+"""Write the pages that are made from tables; check that links between pages lead somewhere.
 
 python docs/build.py            writes docs/metrics.md
 python docs/build.py --check    changes nothing; ends with 1 where a page is not up to date
@@ -38,8 +38,9 @@ def metrics_page() -> str:
     lines = [
         "# Similarity metrics",
         "",
-        "Made by `make docs` from `commonmap.metrics.table.METRICS`. `p` and `q` (or `a` and `b`) are",
-        "the heights of source and target on the cells that both know, as `search.normalise` says.",
+        "Made by `make docs` from `commonmap.metrics.table.METRICS`. `P` and `Q` (or `a` and `b`)",
+        "are the heights of source and target on the cells that both know, normalised as",
+        "`search.normalise` says.",
         "",
         "| name | metric | family | formula | better | reference |",
         "|---|---|---|---|---|---|",

@@ -128,6 +128,7 @@
       if (at.seen >= 0) { gl.enableVertexAttribArray(at.seen); gl.vertexAttribPointer(at.seen, 1, gl.UNSIGNED_BYTE, true, 8, 7); }
       gl.drawArrays(gl.POINTS, 0, set.count);
     }
+    canvas.dataset.painted = String(gl.getError());   // 0: no error
   }
   function draw() { if (!asked) { asked = true; requestAnimationFrame(paint); } }
 
