@@ -36,6 +36,8 @@ def ray_keys(origin: Float32s, end: Float32s, resolution: float) -> list[Key]:
     keys = [(key[0], key[1], key[2])]
     d = end - origin
     length = f32(math.sqrt(float(f32(f32(d[0] * d[0] + d[1] * d[1]) + d[2] * d[2]))))
+    if length == 0:
+        length = f32(1)
     t, dt, step = [math.inf] * 3, [math.inf] * 3, [0] * 3
     for a in range(3):
         direction = f32(d[a] / length)

@@ -351,3 +351,25 @@ def test_two_trees_of_one_input_give_the_same_bytes(tmp_path: Path) -> None:
         contents.append((tmp_path / name).read_bytes())
     assert contents[0] == contents[1]
     assert len(read_octree(tmp_path / "a.ot").depth) > 1000
+
+
+def test_the_bits_of_a_scan_take_little_memory() -> None:
+    rng = np.random.default_rng(9)
+    tree = Octree(0.4)
+    for k in range(5):
+        origin = np.array([0.5 * k, 0.0, 1.5])
+        tree.insert(origin, room_scan(origin, rng), max_range=20.0)
+    first = tree.memory_bytes()
+    assert first < 8e6
+    for k in range(20):
+        origin = np.array([0.1 * k, 0.0, 1.5])
+        tree.insert(origin, room_scan(origin, rng), max_range=20.0)
+    assert tree.memory_bytes() < 1.5 * first
+
+
+def test_a_ray_too_short_for_float32_to_square() -> None:
+    tree = Octree(0.1)
+    tree.insert((0, 0, 0), [[0, 0, -1.7e-26]])
+    tree.insert_rays((0, 0, 0), [[0, 0, -1.7e-26]])
+    values = tree.log_odds_at([[0.05, 0.05, 0.05], [0.05, 0.05, -0.05]])
+    assert values.tolist() == [float(2 * tree.miss), float(2 * tree.hit)]

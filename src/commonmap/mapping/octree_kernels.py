@@ -182,8 +182,8 @@ def _start(  # type: ignore[no-untyped-def]
     )
     dx, dy, dz = x1 - x0, y1 - y0, z1 - z0
     length = np.float32(np.sqrt(np.float64(dx * dx + dy * dy + dz * dz)))
-    if here == end:
-        length = np.float32(1.0)  # an empty ray may have none
+    if not length > 0:
+        length = np.float32(1.0)  # below what float32 can square, 1e-19 m: any length will do
     sx, tx, ddx = ray(x0, x1, kx, resolution, length)
     sy, ty, ddy = ray(y0, y1, ky, resolution, length)
     sz, tz, ddz = ray(z0, z1, kz, resolution, length)
@@ -221,7 +221,7 @@ def trace(  # type: ignore[no-untyped-def]
     a_on = b_on = False
     n = first
     short = False
-    reserved = 0
+    a_reach = b_reach = np.int64(0)  # tiles that each ray may still need
     while True:
         while not (a_on and b_on) and n < last and not short:
             if state[n] == OUT:
@@ -233,12 +233,9 @@ def trace(  # type: ignore[no-untyped-def]
             if here == end:
                 n += 1
                 continue
-            if not (a_on or b_on):
-                reserved = n_tiles
-            if max(reserved, n_tiles) + reach > capacity:
+            if n_tiles + (a_reach if a_on else b_reach) + reach > capacity:
                 short = True
                 break
-            reserved = max(reserved, n_tiles) + reach
             n += 1
             sx = -mx if sx > 0 else -one
             sy = -my if sy > 0 else -one
@@ -246,11 +243,11 @@ def trace(  # type: ignore[no-untyped-def]
             if not a_on:
                 a_on, a_here, a_end, a_length = True, here, end, length
                 a_x, a_y, a_z, a_dx, a_dy, a_dz = x, y, z, dx, dy, dz
-                a_sx, a_sy, a_sz = sx, sy, sz
+                a_sx, a_sy, a_sz, a_reach = sx, sy, sz, reach
             else:
                 b_on, b_here, b_end, b_length = True, here, end, length
                 b_x, b_y, b_z, b_dx, b_dy, b_dz = x, y, z, dx, dy, dz
-                b_sx, b_sy, b_sz = sx, sy, sz
+                b_sx, b_sy, b_sz, b_reach = sx, sy, sz, reach
         if not (a_on or b_on):
             return n, n_tiles
         while a_on and b_on:

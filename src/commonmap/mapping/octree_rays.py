@@ -90,6 +90,8 @@ def insert_rays(  # type: ignore[no-untyped-def]
         if key[0] != last[0] or key[1] != last[1] or key[2] != last[2]:
             dx, dy, dz = end[0] - origin[0], end[1] - origin[1], end[2] - origin[2]
             length = np.float32(np.sqrt(np.float64(dx * dx + dy * dy + dz * dz)))
+            if not length > 0:
+                length = np.float32(1.0)
             for a in range(3):
                 step[a], t[a], dt[a] = ray(origin[a], end[a], key[a], resolution, length)
             while True:
