@@ -108,9 +108,24 @@ def _multiply_add(
                 u[k, 1, i] = U[k, start + i, 1]
         for m in range(first.shape[0] - 1):
             s[:] = 0.0
-            for k in range(first[m], first[m + 1]):
-                re, im = u[f[k], 0], u[f[k], 1]
-                wr, wi = W[w[k], 0, start : start + size], W[w[k], 1, start : start + size]
+            k = first[m]
+            while k + 3 < first[m + 1]:  # four at a time: the sums stay in registers longer
+                ra, ia, rb, ib = u[f[k], 0], u[f[k], 1], u[f[k + 1], 0], u[f[k + 1], 1]
+                rc, ic, rd, ie = u[f[k + 2], 0], u[f[k + 2], 1], u[f[k + 3], 0], u[f[k + 3], 1]
+                xa, ya = W[w[k], 0, start : start + size], W[w[k], 1, start : start + size]
+                xb, yb = W[w[k + 1], 0, start : start + size], W[w[k + 1], 1, start : start + size]
+                xc, yc = W[w[k + 2], 0, start : start + size], W[w[k + 2], 1, start : start + size]
+                xd, yd = W[w[k + 3], 0, start : start + size], W[w[k + 3], 1, start : start + size]
+                for i in range(size):
+                    s[0, i] += ra[i] * xa[i] + rb[i] * xb[i] + rc[i] * xc[i] + rd[i] * xd[i]
+                    s[1, i] += ia[i] * ya[i] + ib[i] * yb[i] + ic[i] * yc[i] + ie[i] * yd[i]
+                for i in range(size):
+                    s[2, i] += ra[i] * ya[i] + rb[i] * yb[i] + rc[i] * yc[i] + rd[i] * yd[i]
+                    s[3, i] += ia[i] * xa[i] + ib[i] * xb[i] + ic[i] * xc[i] + ie[i] * xd[i]
+                k += 4
+            for rest in range(k, first[m + 1]):
+                re, im = u[f[rest], 0], u[f[rest], 1]
+                wr, wi = W[w[rest], 0, start : start + size], W[w[rest], 1, start : start + size]
                 for i in range(size):
                     s[0, i] += re[i] * wr[i]
                     s[1, i] += im[i] * wi[i]

@@ -7,8 +7,8 @@ with a proved bound (derivations: docs/metrics-math.md):
 
 1. `expand`: psi is even and smooth, so on |s| <= L it is a Fourier extension
    `sum_k alpha_k cos(w_k s)`, w_k = k pi / T, T > L, by least squares (Huybrechs 2010).
-2. `separate`: in g, Chebyshev interpolation at J nodes.
-3. `separate`: over x and y + g, the shortest sum of products, by a singular value decomposition.
+2. `separate`: in g, Chebyshev interpolation, and of its polynomials the few mixtures that matter.
+3. `separate`: over x and y, the shortest sum of products, by a singular value decomposition.
 """
 
 from __future__ import annotations
@@ -125,17 +125,19 @@ def expand(name: str, half_width: float, tolerance: float) -> Expansion:
 
 @dataclass(frozen=True, eq=False)
 class Separated:
-    """`(psi + linear)(y - x + g) = sum_m T_m(g') sum_p u_p(x) v_mp(y)`, T_m Chebyshev's.
+    """`(psi + linear)(y - x + g) = sum_l f_l(g) sum_p u_p(x) v_lp(y)`.
 
-    `u_p(x) = source[p] . waves(x)`, `v_mp(y) = target[m, p] . waves(y)`,
-    `waves(x) = [cos(omega x), sin(omega x), x]`, `g' = (g - middle) / half` in [-1, 1].
-    pairs: per m, the p that matter; the others are dropped, and counted in the error.
+    `f_l(g) = sum_m mix[m, l] T_m(g')`, T_m Chebyshev's polynomials, `g' = (g - middle) / half` in
+    [-1, 1]; `u_p(x) = source[p] . waves(x)`, `v_lp(y) = target[l, p] . waves(y)`,
+    `waves(x) = [cos(omega x), sin(omega x), x]`.
+    pairs: per l, the p that matter; the others are dropped, and counted in the error.
     error: a bound for x, y, g in their ranges.
     """
 
     omega: Float64s
     source: Float64s
     target: Float64s
+    mix: Float64s
     middle: float
     half: float
     error: float
@@ -144,6 +146,12 @@ class Separated:
     def waves(self, x: Float64s) -> Float64s:
         """Return (2 K + 1, ...) cosines, then sines, of omega times x, then x."""
         return _waves(self.omega, x)
+
+    def functions(self, g: float) -> Float64s:
+        """Return f_l(g), one number each l."""
+        at = np.clip((g - self.middle) / self.half, -1.0, 1.0) if self.half > 0.0 else 0.0
+        T = np.cos(np.arange(self.mix.shape[0]) * np.arccos(at))
+        return np.asarray(T @ self.mix, np.float64)
 
 
 def _waves(omega: Float64s, x: Float64s) -> Float64s:
@@ -231,6 +239,34 @@ def _bound_residual(residual: Float64s, omega: Float64s, x: Float64s, z: Float64
     return bound[0]
 
 
+def _over_g(
+    expansion: Expansion, linear: float, middle: float, half: float, nodes: int
+) -> Float64s:
+    """Return the Chebyshev coefficients in g of `(psi + linear)(d + g)`, in the waves of d."""
+    alpha, omega = expansion.alpha, expansion.omega
+    theta = (np.arange(nodes) + 0.5) * (np.pi / nodes)
+    g = middle + half * np.cos(theta)
+    angle = np.multiply.outer(g, omega)
+    straight = np.full((nodes, 1), linear)
+    at_nodes = np.concatenate([alpha * np.cos(angle), -alpha * np.sin(angle), straight], axis=1)
+    at_nodes[:, 0] += linear * g
+    to_chebyshev = np.cos(np.multiply.outer(np.arange(nodes), theta)) * (2.0 / nodes)
+    to_chebyshev[0] *= 0.5
+    rows: Float64s = np.einsum("mj,jk->mk", to_chebyshev, at_nodes)
+    return rows
+
+
+def _over_x_and_y(row: Float64s, K: int) -> Float64s:
+    """Return the matrix E with `row . waves(y - x) = waves(x) . E . waves(y)`."""
+    E = np.zeros((2 * K + 1, 2 * K + 1))
+    k = np.arange(K)
+    E[k, k] = E[K + k, K + k] = row[:K]
+    E[k, K + k], E[K + k, k] = row[K : 2 * K], -row[K : 2 * K]
+    E[0, -1] += row[-1]
+    E[-1, 0] -= row[-1]
+    return E
+
+
 @lru_cache(maxsize=64)
 def separate(
     expansion: Expansion,
@@ -245,10 +281,10 @@ def separate(
     x_range, y_range: of ln a and ln b. g_range: of ln(A / B); one number twice where it is
     constant. `|y - x + g| <= expansion.half_width` must hold over the ranges.
     """
-    alpha, omega = expansion.alpha, expansion.omega
+    omega, K = expansion.omega, expansion.omega.size
     middle, half = 0.5 * (g_range[0] + g_range[1]), 0.5 * (g_range[1] - g_range[0])
     nodes = 2 if half > 0.0 and linear else 1
-    while half > 0.0 and interpolation_error(expansion, half, nodes) > 0.3 * tolerance:
+    while half > 0.0 and interpolation_error(expansion, half, nodes) > 0.2 * tolerance:
         nodes += 1
         if nodes > MAX_NODES:
             raise InputError(
@@ -256,50 +292,51 @@ def separate(
                 "over the poses, too much to interpolate; raise the floor or the smallest overlap"
             )
     between = interpolation_error(expansion, half, nodes) if half > 0.0 else 0.0
-    lebesgue = 2.0 / np.pi * np.log(nodes) + 1.0
 
-    # psi as a matrix over x and z = y + g; its singular vectors are the shortest sum of products
-    x = np.linspace(*x_range, 301)
-    z = np.linspace(y_range[0] + g_range[0], y_range[1] + g_range[1], 501)
-    exact = np.diag(np.concatenate([alpha, alpha, [0.0]]))  # cos w(z - x) = cos cos + sin sin
-    exact[0, -1], exact[-1, 0] = linear, -linear  # linear (z - x)
-    few_x, few_z = _waves(omega, x[::4]), _waves(omega, z[::4])
-    left, size, right = np.linalg.svd(few_x.T @ exact @ few_z, full_matrices=False)
+    # in g: the few mixtures of Chebyshev polynomials that matter
+    d = np.linspace(y_range[0] - x_range[1], y_range[1] - x_range[0], 1001)
+    rows = _over_g(expansion, linear, middle, half, nodes)
+    left = np.linalg.svd(np.einsum("mk,kn->mn", rows, _waves(omega, d[::4])))[0]
+    for n_mixed in range(1, nodes + 1):
+        mix = left[:, :n_mixed]
+        aside = rows - np.einsum("ml,nl,nk->mk", mix, mix, rows)
+        unmixed = float(_bound_rows(aside, omega, d).sum()) if n_mixed < nodes else 0.0
+        if unmixed <= 0.2 * tolerance:
+            break
+    louder = np.abs(mix).sum(axis=0)  # a bound of each mixture over g, as |T_m| <= 1
+
+    # over x and y: singular vectors are the shortest sum of products
+    x, y = (np.linspace(a, b, 101 + 2 * int(25.0 * (b - a))) for a, b in (x_range, y_range))
+    few_x, few_y = _waves(omega, x[::2]), _waves(omega, y[::2])
+    exact = [_over_x_and_y(row, K) for row in np.einsum("ml,mk->lk", mix, rows)]
+    over_y = np.concatenate([E @ few_y for E in exact], axis=1)
+    left, size, right = np.linalg.svd(np.einsum("kn,km->nm", few_x, over_y), full_matrices=False)
     cut = 0.4 * tolerance
-    for rank in range(1, 2 * omega.size + 2):
-        source = (exact @ few_z @ (right[:rank].T / size[:rank])).T  # u_p in the waves of x
-        over_z = left[:, :rank].T @ few_x.T @ exact  # v_p in the waves of z
-        residual = exact - source.T @ over_z
-        if lebesgue * _largest_product(few_x, np.einsum("kl,ln->kn", residual, few_z)) > cut:
+    for rank in range(1, 2 * K + 2):
+        source = np.einsum("km,rm->rk", over_y, right[:rank] / size[:rank, None])
+        onto = np.einsum("nr,kn->rk", left[:, :rank], few_x)
+        target = np.stack([np.einsum("rk,kl->rl", onto, E) for E in exact])
+        residual = [
+            E - np.einsum("rk,rl->kl", source, v) for E, v in zip(exact, target, strict=True)
+        ]
+        tried = [_largest_product(few_x, np.einsum("kl,ln->kn", R, few_y)) for R in residual]
+        if float(louder @ np.array(tried)) > cut:
             continue
-        lost = lebesgue * _bound_residual(residual, omega, x, z)
+        lost = float(louder @ np.array([_bound_residual(R, omega, x, y) for R in residual]))
         if lost <= cut:
             break
     else:
-        source, over_z, lost = np.eye(2 * omega.size + 1), exact, 0.0
+        source, target, lost, rank = np.eye(2 * K + 1), np.stack(exact), 0.0, 2 * K + 1
 
-    theta = (np.arange(nodes) + 0.5) * (np.pi / nodes)
-    angle = np.multiply.outer(middle + half * np.cos(theta), omega)
-    c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]  # (J, 1, K)
-    of_cos, of_sin, of_z = over_z[:, : omega.size], over_z[:, omega.size : -1], over_z[:, -1:]
-    straight = np.broadcast_to(of_z, (nodes, *of_z.shape))
-    at_nodes = np.concatenate([of_cos * c + of_sin * s, of_sin * c - of_cos * s, straight], axis=-1)
-    at_nodes[..., 0] += of_z[:, 0] * (middle + half * np.cos(theta))[:, None]  # z = y + g
-    to_chebyshev = np.cos(np.multiply.outer(np.arange(nodes), theta)) * (2.0 / nodes)
-    to_chebyshev[0] *= 0.5
-    target = np.einsum("mj,jpk->mpk", to_chebyshev, at_nodes)
-
-    # products that contribute next to nothing: |T_m| <= 1, so at most max |u_p| max |v_mp| each
-    y = np.linspace(*y_range, 501)
+    # products that contribute next to nothing
     flat = target.reshape(-1, target.shape[-1])
-    reach = _bound_rows(flat, omega, y).reshape(nodes, rank) * _bound_rows(source, omega, x)
+    reach = _bound_rows(flat, omega, y).reshape(-1, rank) * _bound_rows(source, omega, x)
+    reach = reach * louder[:, None]
     order = np.argsort(reach, axis=None, kind="stable")
-    n_dropped = int(np.searchsorted(np.cumsum(reach.ravel()[order]), 0.3 * tolerance))
+    n_dropped = int(np.searchsorted(np.cumsum(reach.ravel()[order]), 0.2 * tolerance))
     matter = np.ones(reach.size, np.bool_)
     matter[order[:n_dropped]] = False
     little = float(reach.ravel()[order[:n_dropped]].sum())
     pairs = tuple(tuple(int(p) for p in np.flatnonzero(row)) for row in matter.reshape(reach.shape))
-    kept = max((m + 1 for m, some in enumerate(pairs) if some), default=1)
-    target, pairs = target[:kept], pairs[:kept]
-    error = expansion.error + between + lost + little
-    return Separated(omega, source, target, middle, half, error, pairs)
+    error = expansion.error + between + unmixed + lost + little
+    return Separated(omega, source, target, mix, middle, half, error, pairs)

@@ -121,7 +121,7 @@ class Products:
                 (spectra * factor[:, None, None]).sum(axis=0, keepdims=True)
                 for spectra, factor in zip(outputs, factors, strict=True)
             ]
-            rounding = np.array([rounding.sum()])  # |T_m| <= 1
+            rounding = np.array([np.max(np.abs(np.stack(weights)), axis=0) @ rounding])
         surfaces = [
             self.frame.correlate(spectra, workers, turned=turn)
             for spectra, turn in zip(outputs, turns, strict=True)
@@ -186,8 +186,9 @@ def moment_products(
 
 @dataclass(frozen=True, eq=False)
 class Kernel:
-    """`sum a^alpha b^beta psi(ln b - ln a + g)`: one output a Chebyshev polynomial of g."""
+    """`sum a^alpha b^beta (psi + linear)(ln b - ln a + g)`: one output a function of g."""
 
+    plan: Smooth
     products: Products
     separated: Separated
 
@@ -260,34 +261,102 @@ def kernel_products(
         spectra.append(fourier.pack(frame.arrays, frame.target_spectra(stack, workers)))
         norms.append(norm(stack))
     W = frame.arrays.xp.concatenate(spectra)
-    return Kernel(Products(frame, layers, W, tuple(pairs), np.concatenate(norms)), separated)
-
-
-def _clenshaw(values: Array, position: Array) -> Array:
-    b1, b2 = 0.0 * position, 0.0 * position
-    for m in range(values.shape[0] - 1, 0, -1):
-        b1, b2 = 2.0 * position * b1 - b2 + values[m], b1
-    return position * b1 - b2 + values[0]
+    return Kernel(plan, Products(frame, layers, W, tuple(pairs), np.concatenate(norms)), separated)
 
 
 @numba.njit(cache=True, nogil=True)
-def _clenshaw_compiled(values: Array, position: Array, out: Array) -> None:  # pragma: no cover
-    for i in range(position.shape[0]):
-        for j in range(position.shape[1]):
-            x = position[i, j]
-            b1, b2 = 0.0, 0.0
-            for m in range(values.shape[0] - 1, 0, -1):
-                b1, b2 = 2.0 * x * b1 - b2 + values[m, i, j], b1
-            out[i, j] = x * b1 - b2 + values[0, i, j]
+def _evaluate_compiled(
+    values: Array,
+    mix: Array,
+    A: Array,
+    B: Array,
+    middle: float,
+    half: float,
+    alpha: float,
+    beta: float,
+    counted: Array,
+    out: Array,
+) -> None:  # pragma: no cover
+    nodes, n_mixed = mix.shape
+    width = A.shape[1]
+    f, x, b1, b2 = np.empty((nodes, width)), np.zeros(width), np.empty(width), np.empty(width)
+    for i in range(A.shape[0]):
+        if half > 0.0:
+            for j in range(width):
+                if counted[i, j]:
+                    x[j] = min(1.0, max(-1.0, (np.log(A[i, j] / B[i, j]) - middle) / half))
+        f[:] = 0.0
+        for k in range(n_mixed):
+            for m in range(nodes):
+                factor = mix[m, k]
+                for j in range(width):
+                    f[m, j] += factor * values[k, i, j]
+        b1[:] = 0.0
+        b2[:] = 0.0
+        for m in range(nodes - 1, 0, -1):
+            for j in range(width):
+                b = 2.0 * x[j] * b1[j] - b2[j] + f[m, j]
+                b2[j] = b1[j]
+                b1[j] = b
+        for j in range(width):
+            if not counted[i, j]:
+                out[i, j] = np.nan
+                continue
+            total = x[j] * b1[j] - b2[j] + f[0, j]
+            if beta == 0.0:
+                out[i, j] = total / A[i, j] if alpha == 1.0 else total
+            else:
+                out[i, j] = total / (A[i, j] ** alpha * B[i, j] ** beta)
 
 
-def chebyshev_sum(arrays: Arrays, values: Array, position: Array) -> Array:
-    """Return `sum_m T_m(position) values[m]` by Clenshaw's recurrence; position in [-1, 1]."""
-    if arrays.name != "numpy":
-        return _clenshaw(values, position)
-    out = np.empty(position.shape, np.float64)
-    _clenshaw_compiled(values, position, out)
-    return out
+def evaluate_kernel(
+    arrays: Arrays, kernel: Kernel, values: Array, A: Array, B: Array, counted: Array
+) -> Array:
+    """Return `sum P^alpha Q^beta (psi + linear)(s)` from the outputs, where counted; else NaN.
+
+    Chebyshev's polynomials of g = ln(A / B) are summed by Clenshaw's recurrence.
+    """
+    separated, plan = kernel.separated, kernel.plan
+    if arrays.name == "numpy":
+        out = np.empty(A.shape, np.float64)
+        _evaluate_compiled(
+            values, np.ascontiguousarray(separated.mix), A, B, separated.middle, separated.half,
+            plan.alpha, plan.beta, counted, out,
+        )  # fmt: skip
+        return out
+    xp = arrays.xp
+    position = xp.zeros(A.shape)
+    if separated.half > 0.0:
+        position = xp.clip((np.log(A / B) - separated.middle) / separated.half, -1.0, 1.0)
+    f = xp.tensordot(xp.asarray(separated.mix), values.astype(np.float64), axes=1)
+    b1, b2 = 0.0 * position, 0.0 * position
+    for m in range(f.shape[0] - 1, 0, -1):
+        b1, b2 = 2.0 * position * b1 - b2 + f[m], b1
+    return (position * b1 - b2 + f[0]) / (A**plan.alpha * B**plan.beta)
+
+
+@numba.njit(cache=True, nogil=True)
+def _ratio_range_compiled(
+    A: Array, B: Array, counted: Array
+) -> tuple[float, float]:  # pragma: no cover
+    low, high = np.inf, 0.0
+    for i in range(A.shape[0]):
+        for j in range(A.shape[1]):
+            if counted[i, j]:
+                ratio = A[i, j] / B[i, j]
+                low, high = min(low, ratio), max(high, ratio)
+    return low, high
+
+
+def ratio_range(arrays: Arrays, A: Array, B: Array, counted: Array) -> tuple[float, float]:
+    """Return the range of ln(A / B) over the counted poses; (0, 0) where none counts."""
+    if arrays.name == "numpy":
+        low, high = _ratio_range_compiled(A, B, counted)
+    else:
+        xp, ratio = arrays.xp, A / B
+        low = float(xp.where(counted, ratio, np.inf).min())
+        high = float(xp.where(counted, ratio, 0.0).max())
+    return (float(np.log(low)), float(np.log(high))) if high > 0.0 else (0.0, 0.0)
 
 
 # Classes ------------------------------------------------------------------------------------------

@@ -122,15 +122,17 @@ def _kernels(
     workers: int,
 ) -> list[Special]:
     """Return, per turn, `sum P^alpha Q^beta (psi(s) + linear s)`, s = ln(Q / P), by expansion."""
-    ratios = []
-    for some in poses:
-        A, B = some.scales(prepared.normalise, some.values)
-        ratios.append(np.log(A / B))
-    constant = prepared.normalise != "overlap"
-    span = (0.0, 0.0)
-    if prepared.normalise != "off":
-        ranges = [_range(g, some.counted) for g, some in zip(ratios, poses, strict=True)]
+    arrays, reading = prepared.frame.arrays, prepared.normalise
+    span, ratios = (0.0, 0.0), [0.0 for _ in poses]
+    if reading == "overlap":
+        ranges = [
+            roads.ratio_range(arrays, some.values["a"], some.values["b"], some.counted)
+            for some in poses
+        ]
         span = _span(ranges, WIDEN)
+    elif reading == "map":
+        ratios = [float(np.log(some.total_s / some.total_t)) for some in poses]
+        span = _span([(g, g) for g in ratios], WIDEN)
     with prepared.lock:
         if span not in prepared.kernels:
             prepared.kernels[span] = roads.kernel_products(
@@ -145,32 +147,24 @@ def _kernels(
             )
         kernel = prepared.kernels[span]
     separated = kernel.separated
-    nodes = len(separated.pairs)
-
-    def position(g: Any) -> Any:
-        if separated.half == 0.0:
-            return 0.0 * g
-        return np.clip((g - separated.middle) / separated.half, -1.0, 1.0)
 
     weights = None
-    if constant:
-        weights = [np.cos(np.arange(nodes) * np.arccos(position(g))) for g in ratios]
+    if reading != "overlap":  # g is one number: a single transform back
+        weights = [separated.functions(g) for g in ratios]
     outputs, rounding = kernel.products.correlate(
         h, known, turns=turns, weights=weights, workers=workers
     )
-    off = float(rounding.sum())
+    louder = np.abs(separated.mix).sum(axis=0) if weights is None else np.ones(1)
+    off = float(louder @ rounding)
 
     def scale(A: Any, B: Any) -> Any:
-        if (plan.alpha, plan.beta) == (1.0, 0.0):
-            return A
         return A**plan.alpha * B**plan.beta
 
     def special(some: Poses, output: Array) -> Special:
         def evaluate(A: Any, B: Any) -> Array:
-            if constant:
+            if weights is not None:
                 return output[0].astype(np.float64) / scale(A, B)
-            sums = roads.chebyshev_sum(prepared.frame.arrays, output, position(np.log(A / B)))
-            return sums / scale(A, B)
+            return roads.evaluate_kernel(arrays, kernel, output, A, B, some.counted)
 
         def error(A: Any, B: Any, values: Mapping[str, Array]) -> Any:
             # sum a^alpha b^beta is n, sum a, or at most sqrt(sum a sum b)
