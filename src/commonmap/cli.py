@@ -64,6 +64,8 @@ def main() -> NoReturn:
     try:
         code = app(standalone_mode=False)
         sys.stdout.flush()
+        if code == INTERRUPTED:  # newer releases of typer catch the interrupt themselves
+            raise KeyboardInterrupt
     except CommonmapError as error:
         _fail(str(error), error.exit_code)
     except USAGE_ERROR as error:

@@ -71,13 +71,15 @@ def merge_clouds(target: Map, source: Map, T_target_source: Float64s, *, voxel: 
     """Return the points of both maps in the target's frame with the provenance of each.
 
     voxel: metres; a point counts as seen by both where the other robot has a point in the same
-    voxel of this edge. The order is kept: first the target's points, then the source's.
+    voxel of this edge, on multiples of it. The order is kept: first the target's points, then the
+    source's.
     """
     xyz_target = points_of(target, "target")
     xyz_source = apply(T_target_source, points_of(source, "source"))
     xyz = np.concatenate([xyz_target, xyz_source])
     seen_by = np.repeat(np.array([TARGET, SOURCE], np.uint8), [len(xyz_target), len(xyz_source)])
-    index = np.floor((xyz - xyz.min(axis=0)) / voxel).astype(np.int64)
+    index = np.floor(xyz / voxel).astype(np.int64)
+    index -= index.min(axis=0)
     size = index.max(axis=0) + 1
     if float(size[0]) * float(size[1]) * float(size[2]) > 2.0**62:
         raise InputError(f"voxels of {voxel:g} m are too small for the extent of these maps")
