@@ -28,7 +28,7 @@ from commonmap.matching.evidence import (
     scatter,
     transform_target,
 )
-from commonmap.matching.refine import Refined, lift, refine, share_of_inliers
+from commonmap.matching.refine import Refined, lift, refine, share_of_inliers, thin
 from commonmap.matching.search import Peaks, evidence_at, plan_search, search
 from commonmap.matching.search_metric import search_metric
 from commonmap.matching.support import measure_support
@@ -66,11 +66,17 @@ class Prepared:
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """One map's layers for matching: height map and slabs on half the cell, and standing points."""
+    """One map's layers for matching: height map and slabs on half the cell, and fewer points.
+
+    xyz: (M, 3) the points that may be used, one mean per voxel of a quarter cell.
+    standing: (M,) bool, above the lowest slab edge. height: (M,) metres above ground.
+    """
 
     grid: GridMap
     slabs: SlabGrid
+    xyz: Float64s
     standing: Bools
+    height: Float64s
 
 
 def match(
@@ -180,8 +186,9 @@ def build_layers(item: Prepared, cell: float, edges: Float64s, max_height: float
         item.xyz, cell=0.5 * cell, slab_edges=edges, ground=item.ground, max_height=max_height
     )
     slabs = pack_slabs(grid.origin, grid.cell, grid["slab_occupied"], grid["slab_known"])
-    standing = (item.height > edges[0]) & (item.height < (max_height or math.inf))
-    return Layers(grid, slabs, standing)
+    points = thin(item.xyz if max_height is None else item.xyz[item.height < max_height], cell / 4)
+    height = points[:, 2] - item.ground.height_at(points[:, :2])
+    return Layers(grid, slabs, points, height > edges[0], height)
 
 
 def _search(
@@ -217,13 +224,7 @@ def _refine(
     if len(found.score) == 0:
         return None
     T = lift(found.T_target_source(), base.ground, draft.ground)
-    used_base, used_draft = _used(base, base_layers), _used(draft, draft_layers)
-    return refine(base.xyz[used_base], draft.xyz[used_draft], T, cell=max(cell, found.cell))
-
-
-def _used(item: Prepared, layers: Layers) -> Bools:
-    """Return (N,) bool, the points below the height that the match may use."""
-    return np.asarray(layers.standing | (item.height <= layers.grid.slab_edges[0]))  # type: ignore[index]
+    return refine(base_layers.xyz, draft_layers.xyz, T, cell=max(cell, found.cell))
 
 
 def measure_figures(
@@ -248,21 +249,17 @@ def measure_figures(
     # How the points lie, at the best pose and at the mirrored map's
     reach = 0.6 * cell
     inliers = share_of_inliers(
-        base.xyz, base_layers.standing, apply(refined.T_target_source, draft.xyz),
-        draft_layers.standing, reach,
+        base_layers.xyz, base_layers.standing,
+        apply(refined.T_target_source, draft_layers.xyz), draft_layers.standing, reach,
     )  # fmt: skip
     decoy_inliers = 0.0
     if len(decoy.score):
         flip = from_xyz_yaw(2.0 * found.centre[0], 0.0, 0.0, 0.0) @ np.diag([-1.0, 1.0, 1.0, 1.0])
-        wrong = apply(flip, draft.xyz)
-        T = lift_mirrored(decoy.T_target_source(), base, wrong, draft)
-        used = _used(draft, draft_layers)
-        again = refine(
-            base.xyz[_used(base, base_layers)], wrong[used], T, cell=max(cell, decoy.cell),
-            n_most=8_000,
-        )  # fmt: skip
+        wrong = apply(flip, draft_layers.xyz)
+        T = lift_mirrored(decoy.T_target_source(), base, wrong, draft_layers)
+        again = refine(base_layers.xyz, wrong, T, cell=max(cell, decoy.cell), n_most=8_000)
         decoy_inliers = share_of_inliers(
-            base.xyz, base_layers.standing, apply(again.T_target_source, wrong),
+            base_layers.xyz, base_layers.standing, apply(again.T_target_source, wrong),
             draft_layers.standing, reach,
         )  # fmt: skip
     return Figures(
@@ -283,7 +280,7 @@ def measure_figures(
 
 
 def lift_mirrored(
-    T_planar: Float64s, base: Prepared, mirrored_xyz: Float64s, draft: Prepared
+    T_planar: Float64s, base: Prepared, mirrored_xyz: Float64s, draft: Layers
 ) -> Float64s:
     """Return the planar motion of the mirrored source with z set by its lowest points."""
     low = np.abs(draft.height) < 0.3

@@ -12,7 +12,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numba
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -96,8 +98,8 @@ def refine(
     # Work about the middle of the overlap: small numbers, and rotations that mean something
     centre = 0.5 * (low + high)
     voxel = max(cell / 3.0, 0.03)
-    target = _thin(target_xyz[inside] - centre, voxel, 3 * n_most)
-    source = _thin(moved_source - centre, voxel, n_most)
+    target = thin(target_xyz[inside] - centre, voxel, 3 * n_most)
+    source = thin(moved_source - centre, voxel, n_most)
 
     # Walk from the search's peak on coarse clouds, then settle on fine ones
     T = _walk(target, source, cell, threads)
@@ -131,7 +133,7 @@ def _walk(target: Float64s, source: Float64s, cell: float, threads: int) -> Floa
     """Return the motion of generalised ICP from the identity, on clouds of about 10,000 points."""
     import small_gicp
 
-    coarse_target, coarse_source = _thin(target, cell / 3.0, 30_000), _thin(source, cell, 10_000)
+    coarse_target, coarse_source = thin(target, cell / 3.0, 30_000), thin(source, cell, 10_000)
     cloud, tree = small_gicp.preprocess_points(
         coarse_target, downsampling_resolution=cell / 12.0, num_neighbors=12, num_threads=threads
     )
@@ -162,19 +164,48 @@ def _inside(points: Float64s, low: Float64s, high: Float64s) -> Bools:
     return inside
 
 
-def _thin(xyz: Float64s, voxel: float, n_most: int) -> Float64s:
+def thin(xyz: Float64s, voxel: float, n_most: int | None = None) -> Float64s:
     """Return the mean point of every voxel, the voxel widened until about `n_most` are left."""
+    if len(xyz) == 0:
+        return xyz
     for _ in range(8):
-        key = np.floor(xyz / voxel).astype(np.int64)
-        key -= key.min(axis=0)
-        span = key.max(axis=0) + 1
-        flat = (key[:, 0] * span[1] + key[:, 1]) * span[2] + key[:, 2]
-        _, inverse, counts = np.unique(flat, return_inverse=True, return_counts=True)
-        if len(counts) <= n_most:
+        order, starts = _group(xyz, voxel)
+        if n_most is None or len(starts) - 1 <= n_most:
             break
-        voxel *= max(1.15, math.sqrt(len(counts) / n_most) * 0.95)
-    mean = np.column_stack([np.bincount(inverse, weights=xyz[:, a]) for a in range(3)])
-    return np.asarray(mean / counts[:, None])
+        voxel *= max(1.15, math.sqrt((len(starts) - 1) / n_most) * 0.95)
+    return np.asarray(_means(xyz, order, starts))
+
+
+def _group(xyz: Float64s, voxel: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the points' order by voxel, and where each voxel starts in it."""
+    key = _voxel_keys(np.ascontiguousarray(xyz), 1.0 / voxel)
+    order = np.argsort(key, kind="stable")
+    edges = np.nonzero(np.diff(key[order]))[0] + 1
+    return order, np.concatenate([[0], edges, [len(key)]]).astype(np.int64)
+
+
+@numba.njit(cache=True)  # type: ignore[misc]
+def _voxel_keys(xyz, scale):  # type: ignore[no-untyped-def]
+    """Return one int64 per point, 21 bits an axis: equal for the points of one voxel."""
+    key = np.empty(xyz.shape[0], np.int64)
+    for n in range(xyz.shape[0]):
+        i = int(np.floor(xyz[n, 0] * scale)) & 0x1FFFFF
+        j = int(np.floor(xyz[n, 1] * scale)) & 0x1FFFFF
+        k = int(np.floor(xyz[n, 2] * scale)) & 0x1FFFFF
+        key[n] = (i << 42) | (j << 21) | k
+    return key
+
+
+@numba.njit(cache=True)  # type: ignore[misc]
+def _means(xyz, order, starts):  # type: ignore[no-untyped-def]
+    out = np.zeros((starts.shape[0] - 1, 3))
+    for v in range(starts.shape[0] - 1):
+        for n in range(starts[v], starts[v + 1]):
+            for a in range(3):
+                out[v, a] += xyz[order[n], a]
+        for a in range(3):
+            out[v, a] /= starts[v + 1] - starts[v]
+    return out
 
 
 def _solve_point_to_plane(
@@ -238,11 +269,11 @@ def share_of_inliers(
         return 0.0
     low, high = draft.min(axis=0) - reach, draft.max(axis=0) + reach
     inside = _inside(target[:, :2], low, high)
-    base = _thin(target[inside], 0.5 * reach, 1_000_000) if inside.any() else target[:0]
+    base = thin(target[inside], 0.5 * reach, 1_000_000) if inside.any() else target[:0]
     upright = target[inside & target_standing]
     if len(base) == 0 or len(upright) == 0:
         return 0.0
-    upright = _thin(upright, 0.3 * reach, 1_000_000)
+    upright = thin(upright, 0.3 * reach, 1_000_000)
     columns = np.unique(np.floor(base[:, :2] / reach).astype(np.int64), axis=0)
     over, _ = cKDTree((columns + 0.5) * reach).query(draft[:, :2], distance_upper_bound=reach)
     near, _ = cKDTree(upright).query(draft, distance_upper_bound=reach)
