@@ -174,7 +174,12 @@ def as_map(map_: Map | ArrayLike) -> Map:
     """Return a cloud or an octree as it is, an (N, 3) array as a cloud."""
     if isinstance(map_, Cloud | Leaves):
         return map_
-    values: Any = np.asarray(map_)
+    try:
+        values: Any = np.asarray(map_)
+    except ValueError:  # rows of unequal length
+        raise InputError(
+            "a map must be an (N, 3) array of x, y, z; rows differ in length"
+        ) from None
     if values.dtype == object:
         raise InputError("a map is a Cloud, Leaves or an (N, 3) array of x, y, z in metres")
     return Cloud(xyz=check_points(values, "a map"))
