@@ -233,21 +233,19 @@ def _source_heights(
 
 
 def _count(
-    prepared: PreparedTarget, seen: Array, rounding: float, known: Bools, workers: int
+    prepared: PreparedTarget, seen: Array, rounding: float, known: Bools, turn: bool, workers: int
 ) -> tuple[Array, Array]:
-    """Return the whole number of cells known in both, and which poses count; (Sx, Sy) each."""
+    """Return the whole number of cells known in both, and which poses count; (Nx, Ny) each."""
     frame = prepared.frame
     if rounding > 0.25:  # large maps: single precision no longer tells whole numbers apart
         exact = replace(frame, dtype=np.float64)
         U = exact.source_spectra(known[None].astype(np.float64), workers)
         V = exact.target_spectra(prepared.known[None].astype(np.float64), workers)
-        seen = exact.correlate(U * V, workers)[0]
+        seen = exact.correlate((U.conj() if turn else U) * V, workers)[0]
     n = frame.arrays.xp.rint(seen)
-    for axis in (0, 1):
-        length, all_shifts = frame.shape[axis], frame.out_shape[axis]
-        if length < all_shifts:
-            rim = (slice(None),) * axis
-            n[(*rim, slice(0, all_shifts - length))] = 0.0
+    for axis in (0, 1):  # shifts of the rim that wrap onto each other
+        wrapped = np.arange(max(0, frame.out_shape[axis] - frame.shape[axis]))
+        n[(slice(None),) * axis + (frame.rows_of(wrapped, axis, turned=turn),)] = 0.0
     return n, n >= prepared.min_cells
 
 
@@ -282,7 +280,14 @@ def score_half_turns(
     turn only conjugates spectra, so source transforms and products serve both. Scores agree
     with those of `score_surface` within the bound, not to the bit.
     """
-    first, second = _score(prepared, height_s, known_s, (False, True), bound, workers)
+    if isinstance(prepared.metric.fft, Moments | Smooth):
+        first, second = _score(prepared, height_s, known_s, (False, True), bound, workers)
+        return first, second
+    (first,) = _score(prepared, height_s, known_s, (False,), bound, workers)
+    sx, sy = prepared.frame.source_shape
+    pad = ((0, sx - height_s.shape[0]), (0, sy - height_s.shape[1]))
+    h, known = np.pad(height_s, pad)[::-1, ::-1], np.pad(known_s, pad)[::-1, ::-1]
+    (second,) = _score(prepared, h, known, (False,), bound, workers)
     return first, second
 
 
@@ -299,9 +304,9 @@ def _score(
     moments, rounding = prepared.moments.correlate(h, known, turns=turns, workers=workers)
     poses = []
     for outputs, turn in zip(moments, turns, strict=True):
-        seen = known[::-1, ::-1] if turn else known
-        n, counted = _count(prepared, outputs[0], float(rounding[0]), seen, workers)
-        poses.append(_gather(prepared, outputs, rounding, n, counted, float(h[known].sum())))
+        n, counted = _count(prepared, outputs[0], float(rounding[0]), known, turn, workers)
+        total = float(h[known].sum())
+        poses.append(_gather(prepared, outputs, rounding, n, counted, turn, total))
     # the one sum that is not a moment
     specials = find_specials(prepared, h, known, poses, turns, workers)
     return [
@@ -316,6 +321,7 @@ def _gather(
     rounding: Float64s,
     n: Array,
     counted: Array,
+    turn: bool,
     total_s: float,
 ) -> Poses:
     """Return what the moments say of all poses, in double precision."""
@@ -327,7 +333,7 @@ def _gather(
         for name in ("a", "b"):
             if name in values:
                 values[name] = xp.maximum(values[name], safe * prepared.floor)
-    return Poses(safe, n, counted, values, errors, total_s, prepared.total)
+    return Poses(safe, n, counted, turn, values, errors, total_s, prepared.total)
 
 
 def _combine(
@@ -335,7 +341,7 @@ def _combine(
 ) -> Surface:
     """Return the surface of the metric from its sums; NaN where a pose does not count."""
     frame, xp = prepared.frame, prepared.frame.arrays.xp
-    n_overlap = frame.place(poses.n_seen.astype(np.int32), 0)
+    n_overlap = frame.place(poses.n_seen.astype(np.int32), 0, turned=poses.turned)
 
     def score(values: dict[str, Array], push: float = 0.0) -> Array:
         A, B = poses.scales(prepared.normalise, values)
@@ -360,8 +366,10 @@ def _combine(
             spread = 1e-12 * (1.0 + np.abs(result))
             for up, down in zip(trials[::2], trials[1::2], strict=True):
                 spread = spread + xp.fmax(np.abs(up - result), np.abs(down - result))
-            spread = frame.place(xp.where(poses.counted, spread, np.nan), np.nan)
-    whole = frame.place(xp.where(poses.counted, result, np.nan), np.nan)
+            spread = frame.place(
+                xp.where(poses.counted, spread, np.nan), np.nan, turned=poses.turned
+            )
+    whole = frame.place(xp.where(poses.counted, result, np.nan), np.nan, turned=poses.turned)
     return Surface(whole, n_overlap, frame.source_shape, spread)
 
 

@@ -22,16 +22,17 @@ WIDEN = 0.25
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """What the moments say of all poses: arrays (Sx, Sy).
+    """What the moments say of all poses: arrays (Nx, Ny), shifts modulo the transforms' size.
 
-    n: cells, 1 where not counted. n_seen: cells. counted: enough of them. values: the
-    moments. errors: what rounding may have added. total_s, total_t: sums
-    of the whole maps.
+    n: cells, 1 where not counted. n_seen: cells. counted: enough of them. turned: after half a
+    turn. values: the moments. errors: what rounding may have added. total_s, total_t: sums of the
+    whole maps.
     """
 
     n: Array
     n_seen: Array
     counted: Array
+    turned: bool
     values: dict[str, Array]
     errors: dict[str, Any]
     total_s: float
@@ -65,13 +66,7 @@ def find_specials(
     plan = prepared.metric.fft
     if isinstance(plan, Smooth):
         return [*_kernels(prepared, plan, h, known, poses, turns, workers)]
-    return [
-        _find_special(
-            prepared, h[::-1, ::-1] if turn else h, known[::-1, ::-1] if turn else known, some,
-            workers,
-        )
-        for some, turn in zip(poses, turns, strict=True)
-    ]  # fmt: skip
+    return [_find_special(prepared, h, known, some, workers) for some in poses]
 
 
 def _find_special(
