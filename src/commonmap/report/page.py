@@ -194,7 +194,7 @@ def _viewer(base: Shown, draft: Shown | None, common: CommonMap | None, *, accep
         '<button type="button" id="viewer-reset">reset view</button></span></div>'
         '<noscript><p class="note">The 3D picture needs JavaScript; the pictures below do not.</p>'
         "</noscript>"
-        f'<script type="application/json" id="viewer-data">{_script_safe(data)}</script>'
+        f'<script type="application/json" id="viewer-data">{data}</script>'
     )
     return _section(
         "Both maps in 3D",
@@ -429,8 +429,3 @@ def _legend(items: Sequence[tuple[str, Sequence[int]]]) -> str:
         for name, c in items
     )
     return f'<ul class="legend">{rows}</ul>'
-
-
-def _script_safe(text: str) -> str:
-    """Return JSON that cannot end the script element it stands in."""
-    return text.replace("<", "\\u003c")
