@@ -21,8 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from commonmap.errors import EmptyMapError, InputError
-from commonmap.matching import roads
 from commonmap.matching.arrays import Array, choose_shape, find_arrays
+from commonmap.matching.classes import Classes, Steps, class_products
+from commonmap.matching.kernels import Kernel
+from commonmap.matching.roads import Frame, Products, moment_products
 from commonmap.matching.special import Poses, Special, find_specials
 from commonmap.metrics.plans import (
     A_SUM,
@@ -72,15 +74,15 @@ class PreparedTarget:
     height_range: tuple[float, float]
     min_cells: int
     tolerance: float
-    frame: roads.Frame
+    frame: Frame
     height: Float64s
     known: Bools
     offset: float
     total: float
     names: tuple[str, ...]
-    moments: roads.Products
-    classes: roads.Classes | None
-    kernels: dict[tuple[float, float], roads.Kernel] = field(default_factory=dict)
+    moments: Products
+    classes: Classes | None
+    kernels: dict[tuple[float, float], Kernel] = field(default_factory=dict)
     lock: Any = field(default_factory=Lock)
 
     @property
@@ -169,7 +171,7 @@ def prepare_target(
 
     tx, ty = height.shape
     sx, sy = source_shape
-    frame = roads.Frame(
+    frame = Frame(
         find_arrays(xp),
         choose_shape((tx, ty), (sx, sy), min_cells),
         (sx, sy),
@@ -178,7 +180,7 @@ def prepare_target(
     )
     terms: dict[str, tuple[Term, ...]] = dict(COUNT)
     unit, offset = float(np.sqrt(floor * max(high, floor))), 0.0
-    cut: roads.Classes | None = None
+    cut: Classes | None = None
     if isinstance(plan, Moments | Smooth):
         terms.update(plan.terms if isinstance(plan, Moments) else {**A_SUM, **B_SUM})
         if reading == "overlap":
@@ -191,12 +193,12 @@ def prepare_target(
         edges = (np.log(low), np.log(high)) if logarithmic else (low, high)
         wide = max(float(edges[1] - edges[0]), 1e-6)
         count = classes or (8 if isinstance(plan, JointHistogram) else 32)
-        steps = roads.Steps(float(edges[0]), float(edges[0]) + wide, count, logarithmic)
-        cut = roads.class_products(frame, steps, height, known, workers)
+        steps = Steps(float(edges[0]), float(edges[0]) + wide, count, logarithmic)
+        cut = class_products(frame, steps, height, known, workers)
         if not isinstance(plan, JointHistogram):
             height = steps.snap(height)
     height = np.where(known, height - offset, 0.0)
-    moments = roads.moment_products(frame, terms, height, known, unit=unit, workers=workers)
+    moments = moment_products(frame, terms, height, known, unit=unit, workers=workers)
     return PreparedTarget(
         row, reading, floor, (low, high), min_cells, tolerance, frame, height, known, offset,
         float(height[known].sum()), tuple(terms), moments, cut,

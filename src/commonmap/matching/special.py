@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from commonmap.matching import roads
 from commonmap.matching.arrays import Array
+from commonmap.matching.classes import mutual_information
+from commonmap.matching.kernels import evaluate_kernel, kernel_products, ratio_range
 from commonmap.metrics.plans import DifferenceSum, JointHistogram, Moments, RatioSum, Smooth
 from commonmap.types import Bools, Float64s
 
@@ -79,7 +80,7 @@ def _find_special(
     if isinstance(plan, JointHistogram):
         frame = prepared.frame
         mask = frame.target_spectra(prepared.known[None].astype(np.float64), workers)[0]
-        value = roads.mutual_information(prepared.classes, h, known, mask, poses.n, workers)
+        value = mutual_information(prepared.classes, h, known, mask, poses.n, workers)
         return Special("score", lambda A, B: value, lambda A, B, v: 0.0)
     if isinstance(plan, DifferenceSum):
         shift = (poses.values["a"] - poses.values["b"]) / poses.n
@@ -121,8 +122,7 @@ def _kernels(
     span, ratios = (0.0, 0.0), [0.0 for _ in poses]
     if reading == "overlap":
         ranges = [
-            roads.ratio_range(arrays, some.values["a"], some.values["b"], some.counted)
-            for some in poses
+            ratio_range(arrays, some.values["a"], some.values["b"], some.counted) for some in poses
         ]
         span = _span(ranges, WIDEN)
     elif reading == "map":
@@ -130,7 +130,7 @@ def _kernels(
         span = _span([(g, g) for g in ratios], WIDEN)
     with prepared.lock:
         if span not in prepared.kernels:
-            prepared.kernels[span] = roads.kernel_products(
+            prepared.kernels[span] = kernel_products(
                 prepared.frame,
                 plan,
                 (float(np.log(prepared.height_range[0])), float(np.log(prepared.height_range[1]))),
@@ -159,7 +159,7 @@ def _kernels(
         def evaluate(A: Any, B: Any) -> Array:
             if weights is not None:
                 return output[0].astype(np.float64) / scale(A, B)
-            return roads.evaluate_kernel(arrays, kernel, output, A, B, some.counted)
+            return evaluate_kernel(arrays, kernel, output, A, B, some.counted)
 
         def error(A: Any, B: Any, values: Mapping[str, Array]) -> Any:
             # sum a^alpha b^beta is n, sum a, or at most sqrt(sum a sum b)
