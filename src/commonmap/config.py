@@ -54,19 +54,21 @@ class SearchConfig:
         nothing.
     floor: the height that stands for "flat ground" where a metric needs positive heights, metres.
     min_overlap: a pose at which a smaller share of the source's known cells meets known cells of
-        the target cannot win.
+        the target cannot win. None: a tenth for the evidence, which grows with the overlap; half
+        for metrics that are means over the overlap, which a few cells reach by luck.
     n_rivals: how many other poses are kept.
     """
 
     metric: str = "evidence"
     normalise: Literal["overlap", "map", "off"] = "overlap"
     floor: float = 0.05
-    min_overlap: float = 0.1
+    min_overlap: float | None = None
     n_rivals: int = 5
 
     def __post_init__(self) -> None:
         _require_positive("search.floor", self.floor)
-        _require_share("search.min_overlap", self.min_overlap)
+        if self.min_overlap is not None:
+            _require_share("search.min_overlap", self.min_overlap)
         if self.n_rivals < 0:
             raise InputError(f"search.n_rivals must not be negative; {self.n_rivals} came")
 

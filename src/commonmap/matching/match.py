@@ -117,6 +117,13 @@ def match(
         found = _search(base_layers, draft_layers, config, False, progress)
     with _timed(timings, "decoy"):
         decoy = _search(base_layers, draft_layers, config, True, progress)
+    witness, witness_decoy = found, decoy
+    if METRICS[config.search.metric].layers != "slabs":
+        # Whatever metric searched, the verdict is on evidence against what chance finds of it
+        with _timed(timings, "witness"):
+            by_evidence = config.with_values(search={"metric": "evidence"})
+            witness = _search(base_layers, draft_layers, by_evidence, False, progress)
+            witness_decoy = _search(base_layers, draft_layers, by_evidence, True, progress)
 
     # 4. z in closed form, then all six degrees of freedom on the points
     with _timed(timings, "refine"):
@@ -127,7 +134,7 @@ def match(
     with _timed(timings, "decide"):
         progress("decide")
         figures = measure_figures(
-            base, draft, base_layers, draft_layers, found, decoy, refined, cell
+            base, base_layers, draft_layers, found, witness, witness_decoy, refined, cell
         )
         verdict = decide(figures)
         if config.decide.mode == "off":
@@ -191,6 +198,13 @@ def build_layers(item: Prepared, cell: float, edges: Float64s, max_height: float
     return Layers(grid, slabs, points, height > edges[0], height)
 
 
+def least_overlap(config: Config) -> float:
+    """Return the share of the source's known cells that a pose must place on known cells."""
+    if config.search.min_overlap is not None:
+        return config.search.min_overlap
+    return 0.1 if METRICS[config.search.metric].layers == "slabs" else 0.5
+
+
 def _search(
     base: Layers, draft: Layers, config: Config, mirrored: bool, progress: Progress
 ) -> Peaks:
@@ -206,12 +220,12 @@ def _search(
         )
     if METRICS[config.search.metric].layers == "slabs":
         return search(
-            base.slabs, draft.slabs, min_overlap=config.search.min_overlap, mirrored=mirrored,
+            base.slabs, draft.slabs, min_overlap=least_overlap(config), mirrored=mirrored,
             workers=WORKERS, progress=tell,
         )  # fmt: skip
     return search_metric(
         base.grid, draft.grid, metric=config.search.metric, normalise=config.search.normalise,
-        floor=config.search.floor, min_overlap=config.search.min_overlap, mirrored=mirrored,
+        floor=config.search.floor, min_overlap=least_overlap(config), mirrored=mirrored,
         workers=WORKERS, progress=tell,
     )  # fmt: skip
 
@@ -228,21 +242,23 @@ def _refine(
 
 
 def measure_figures(
-    base: Prepared, draft: Prepared, base_layers: Layers, draft_layers: Layers, found: Peaks,
+    base: Prepared, base_layers: Layers, draft_layers: Layers, found: Peaks, witness: Peaks,
     decoy: Peaks, refined: Refined | None, cell: float,
 ) -> Figures:  # fmt: skip
-    """Return what the verdict rests on, always in terms of evidence, whatever metric searched."""
+    """Return what the verdict on the best pose of `found` rests on.
+
+    witness, decoy: peaks of the evidence, of the source as it is and mirrored.
+    """
     if refined is None or len(found.score) == 0:
         return Figures(0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
     grid = coarsen(base_layers.slabs, 2)
     columns = _about(list_columns(draft_layers.slabs), found.centre, mirrored=False)
-    mirrored = _about(list_columns(draft_layers.slabs), found.centre, mirrored=True)
-    second = second_rank(found, cell)
     best_score, n_overlap = evidence_at(grid, columns, found.pose[0])
-    second_score = evidence_at(grid, columns, found.pose[second])[0] if second else 0.0
-    decoy_score = evidence_at(grid, mirrored, decoy.pose[0])[0] if len(decoy.score) else 0.0
+    elsewhere = other_poses(witness, found.pose[0], cell)
+    second_score = float(witness.score[elsewhere].max(initial=0.0))
+    decoy_score = float(decoy.score.max(initial=0.0))
     support = measure_support(grid, columns, found.pose[0])
-    yaw_best = found.per_yaw[:, 1][np.isfinite(found.per_yaw[:, 1])]
+    yaw_best = witness.per_yaw[:, 1][np.isfinite(witness.per_yaw[:, 1])]
     middle = float(np.median(yaw_best))
     spread = 1.4826 * float(np.median(np.abs(yaw_best - middle)))
 
@@ -265,7 +281,7 @@ def measure_figures(
     return Figures(
         decoy_ratio=best_score / max(decoy_score, 1e-9),
         second_ratio=best_score / max(second_score, 1e-9),
-        prominence=(float(found.per_yaw[:, 1].max()) - middle) / max(spread, 1e-9),
+        prominence=(float(yaw_best.max()) - middle) / max(spread, 1e-9),
         support=support.share,
         effect=support.effect,
         support_t=support.t,
@@ -292,13 +308,12 @@ def lift_mirrored(
     return lifted
 
 
-def second_rank(found: Peaks, cell: float) -> int:
-    """Return the rank of the best pose that is another place or heading; 0 where there is none."""
-    delta = found.pose - found.pose[0]
+def other_poses(peaks: Peaks, pose: Float64s, cell: float) -> Bools:
+    """Return (M,) bool, the peaks that are another place or another heading than `pose`."""
+    delta = peaks.pose - pose
     away = np.hypot(delta[:, 0], delta[:, 1]) > max(3.0, 5.0 * cell)
     turned = np.abs((delta[:, 2] + np.pi) % (2.0 * np.pi) - np.pi) > math.radians(10.0)
-    other = np.nonzero(away | turned)[0]
-    return int(other[0]) if len(other) else 0
+    return np.asarray(away | turned)
 
 
 def _about(columns: Columns, centre: Float64s, *, mirrored: bool) -> Columns:
@@ -317,9 +332,13 @@ def _answer(
     def in_map_frames(T: Float64s) -> Float64s:
         return np.asarray(T_map_prepared @ T @ draft.T_prepared_map)
 
+    # The search counts up; the answer gives the metric's own value
+    own_sign = 1.0 if METRICS[config.search.metric].maximise else -1.0
+    score, decoy_score = own_sign * found.score, own_sign * decoy.score
+
     def candidate(rank: int) -> Candidate:
         T = lift(found.T_target_source(rank), base.ground, draft.ground)
-        return Candidate(in_map_frames(T), float(found.score[rank]), float(found.overlap[rank]))
+        return Candidate(in_map_frames(T), float(score[rank]), float(found.overlap[rank]))
 
     accepted = verdict.accepted and refined is not None
     n_found = len(found.score)
@@ -333,7 +352,7 @@ def _answer(
             covariance = R @ refined.covariance @ R.T
             centre = apply(T_map_prepared, refined.centre[None])[0]
         else:
-            own = Candidate(best, float(found.score[0]), float(found.overlap[0]))
+            own = Candidate(best, float(score[0]), float(found.overlap[0]))
             others = [own, *others][: max(config.search.n_rivals, 1)]
     return Match(
         accepted=accepted,
@@ -343,8 +362,8 @@ def _answer(
         covariance=covariance,
         covariance_centre=centre,
         overlap=float(found.overlap[0]) if n_found else 0.0,
-        score=float(found.score[0]) if n_found else 0.0,
-        decoy_score=float(decoy.score[0]) if len(decoy.score) else 0.0,
+        score=float(score[0]) if n_found else 0.0,
+        decoy_score=float(decoy_score[0]) if len(decoy_score) else 0.0,
         rivals=tuple(others),
         metric=config.search.metric,
         evidence={**figures.as_dict(), "cell": found.cell},
@@ -377,7 +396,7 @@ def _draw(
     )  # fmt: skip
     score, _ = evidence_surface(
         transform_target(grid, (side, side), workers=WORKERS), occupied, known,
-        min_overlap=config.search.min_overlap * np.count_nonzero(known), workers=WORKERS,
+        min_overlap=least_overlap(config) * np.count_nonzero(known), workers=WORKERS,
     )  # fmt: skip
     shift = -invert(base_map.T_prepared_map)[:2, 3]
     x, y = (

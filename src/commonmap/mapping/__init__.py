@@ -1,0 +1,1 @@
+"""Scans and clouds into octrees, ground surfaces, height maps and slabs."""

@@ -1,0 +1,1 @@
+"""Fuse octrees, clouds and height maps that share a frame."""
