@@ -266,3 +266,24 @@ def test_the_path_of_other_array_modules(name: str, monkeypatch: pytest.MonkeyPa
     _, turned = score_half_turns(prepared, height_s, known_s)
     alone = score_surface(prepared, height_s[::-1, ::-1], known_s[::-1, ::-1])
     np.testing.assert_allclose(turned.score, alone.score, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["k", "mi", "zncc"])
+def test_shifts_that_wrap_onto_each_other_are_not_scored(name: str) -> None:
+    rng = np.random.default_rng(13)
+    height_s, height_t = rng.uniform(0, TOP, (10, 10)), rng.uniform(0, TOP, (40, 40))
+    known_s, known_t = np.ones((10, 10), bool), np.ones((40, 40), bool)
+    prepared = prepare_target(
+        name, height_t, known_t, (10, 10), height_range=(0, TOP), min_cells=11, dtype=np.float64
+    )
+    assert prepared.frame.shape == (48, 48)  # for 49 shifts: the first and the last share a place
+    n = scipy.signal.convolve(known_t.astype(int), known_s.astype(int), method="direct")
+    for surface, flip in zip(score_half_turns(prepared, height_s, known_s), (1, -1), strict=True):
+        slow = direct_surface(
+            name, height_s[::flip, ::flip], known_s, height_t, known_t, min_cells=11
+        )
+        assert np.array_equal(np.isnan(surface.score), np.isnan(slow))
+        assert np.array_equal(np.isnan(slow), n < 11)
+        assert np.nanmax(np.abs(surface.score - slow)) < 2e-6
+        assert np.array_equal(surface.n_overlap[n >= 11], n[n >= 11])
+        assert not surface.n_overlap[[0, -1]].any() and not surface.n_overlap[:, [0, -1]].any()
