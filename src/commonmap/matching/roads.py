@@ -66,17 +66,16 @@ class Frame:
     def place(self, seen: Array, fill: float, *, turned: bool) -> Array:
         """Return what `correlate` gave for one layer as the surface, on the host.
 
-        Shifts of the rim that wrap onto each other are filled.
+        Shifts beyond the size of the transforms are filled.
         """
         host = self.arrays.to_host(seen)
         whole = np.full(self.out_shape, fill, host.dtype)
         spans = []
         for axis in (0, 1):
-            wrapped = max(0, self.out_shape[axis] - self.shape[axis])
-            start, stop = wrapped, min(self.out_shape[axis], self.shape[axis])
-            first = int(self.rows_of(start, axis, turned=turned))
-            until = min(stop, start + self.shape[axis] - first)  # then the places start at 0 again
-            spans.append(((start, until, first), (until, stop, 0)))
+            stop = min(self.out_shape[axis], self.shape[axis])
+            first = int(self.rows_of(0, axis, turned=turned))
+            until = min(stop, self.shape[axis] - first)  # from here the places start at 0 again
+            spans.append(((0, until, first), (until, stop, 0)))
         for u0, u1, i in spans[0]:
             for v0, v1, j in spans[1]:
                 if u1 > u0 and v1 > v0:
