@@ -68,7 +68,7 @@ class Prepared:
 class Layers:
     """One map's layers for matching: height map and slabs on half the cell, and fewer points.
 
-    xyz: (M, 3) the points that may be used, one mean per voxel of a quarter cell.
+    xyz: (M, 3) the points that may be used, one mean per voxel of a quarter cell or 0.1 m.
     standing: (M,) bool, above the lowest slab edge. height: (M,) metres above ground.
     """
 
@@ -193,7 +193,10 @@ def build_layers(item: Prepared, cell: float, edges: Float64s, max_height: float
         item.xyz, cell=0.5 * cell, slab_edges=edges, ground=item.ground, max_height=max_height
     )
     slabs = pack_slabs(grid.origin, grid.cell, grid["slab_occupied"], grid["slab_known"])
-    points = thin(item.xyz if max_height is None else item.xyz[item.height < max_height], cell / 4)
+    points = thin(
+        item.xyz if max_height is None else item.xyz[item.height < max_height],
+        min(0.25 * cell, 0.1),
+    )
     height = points[:, 2] - item.ground.height_at(points[:, :2])
     return Layers(grid, slabs, points, height > edges[0], height)
 
@@ -273,7 +276,9 @@ def measure_figures(
         flip = from_xyz_yaw(2.0 * found.centre[0], 0.0, 0.0, 0.0) @ np.diag([-1.0, 1.0, 1.0, 1.0])
         wrong = apply(flip, draft_layers.xyz)
         T = lift_mirrored(decoy.T_target_source(), base, wrong, draft_layers)
-        again = refine(base_layers.xyz, wrong, T, cell=max(cell, decoy.cell), n_most=8_000)
+        again = refine(
+            base_layers.xyz, wrong, T, cell=max(cell, decoy.cell), n_most=8_000, settle=False
+        )
         decoy_inliers = share_of_inliers(
             base_layers.xyz, base_layers.standing, apply(again.T_target_source, wrong),
             draft_layers.standing, reach,
@@ -342,7 +347,10 @@ def _answer(
 
     accepted = verdict.accepted and refined is not None
     n_found = len(found.score)
-    others = [candidate(rank) for rank in range(1, min(n_found, 1 + config.search.n_rivals))]
+    others: list[Candidate] = []
+    if n_found:
+        elsewhere = np.nonzero(other_poses(found, found.pose[0], found.cell))[0]
+        others = [candidate(int(rank)) for rank in elsewhere[: config.search.n_rivals]]
     T, covariance, centre = None, None, None
     if refined is not None:
         best = in_map_frames(refined.T_target_source)

@@ -80,14 +80,14 @@ def refine(
     cell: float,
     threads: int = 2,
     n_most: int = 40_000,
+    settle: bool = True,
 ) -> Refined:
     """Return the pose refined on the points, starting from within about one `cell` of the truth.
 
     target_xyz: (N, 3), source_xyz: (M, 3) metres. cell: metres, of the search. Points are thinned
-    to one per voxel of a third of the cell, or coarser to stay near `n_most`.
+    to one per voxel of a third of the cell, or coarser to stay near `n_most`. settle: end on finer
+    points.
     """
-    import small_gicp
-
     start = np.asarray(T_target_source, dtype=np.float64)
     moved_source = apply(start, source_xyz)
     low, high = moved_source.min(axis=0) - 2.0 * cell, moved_source.max(axis=0) + 2.0 * cell
@@ -101,15 +101,22 @@ def refine(
     target = thin(target_xyz[inside] - centre, voxel, 3 * n_most)
     source = thin(moved_source - centre, voxel, n_most)
 
-    # Walk from the search's peak on coarse clouds, then settle on fine ones
+    # Walk from the search's peak on coarse clouds, then settle on finer ones
     T = _walk(target, source, cell, threads)
-    cloud, _ = small_gicp.preprocess_points(
-        target, downsampling_resolution=voxel / 4.0, num_neighbors=12, num_threads=threads
-    )
-    points, normals = np.asarray(cloud.points())[:, :3], np.asarray(cloud.normals())[:, :3]
+    surface = _surface(target, voxel, threads)
     covariance, rms = np.eye(6), float("inf")
     for reach in (1.5 * cell, 0.75 * cell):
-        T, covariance, rms = _solve_point_to_plane(points, normals, source, T, reach=reach)
+        T, covariance, rms = _solve_point_to_plane(*surface, source, T, reach=reach)
+
+    # The last centimetres come from the finest points, within reach of what the last step left
+    fine = max(0.05, 0.3 * voxel)
+    reach = 4.0 * rms
+    if settle and fine < voxel and math.isfinite(rms) and reach < 0.75 * cell:
+        surface = _surface(thin(target_xyz[inside] - centre, fine, 4 * n_most), fine, threads)
+        source = thin(moved_source - centre, fine, 2 * n_most)
+        T, covariance, rms = _solve_point_to_plane(
+            *surface, source, T, reach=max(reach, 2.0 * fine)
+        )
 
     shift = float(np.linalg.norm(T[:3, 3]))
     turn = float(Rotation.from_matrix(T[:3, :3]).magnitude())
@@ -127,6 +134,16 @@ def refine(
         (shift, turn),
         stayed,
     )
+
+
+def _surface(xyz: Float64s, voxel: float, threads: int) -> tuple[Float64s, Float64s]:
+    """Return the points and their unit normals, each (N, 3), from 20 neighbours."""
+    import small_gicp
+
+    cloud, _ = small_gicp.preprocess_points(
+        xyz, downsampling_resolution=voxel / 4.0, num_neighbors=20, num_threads=threads
+    )
+    return np.asarray(cloud.points())[:, :3], np.asarray(cloud.normals())[:, :3]
 
 
 def _walk(target: Float64s, source: Float64s, cell: float, threads: int) -> Float64s:
