@@ -22,6 +22,9 @@ from commonmap.types import Float64s
 MAX_SIGMA = math.radians(2.0)
 """Where the parts of a map disagree by more than this (standard error), nothing upright told."""
 
+FINEST_STEP = math.radians(0.5)
+"""The last grid of directions is this fine or finer; a paraboloid through it gives the answer."""
+
 PRIOR_TILT = math.radians(1.5)
 """How far from level a map is expected to be that says it is (standard deviation)."""
 
@@ -115,11 +118,28 @@ def _sharpest(
         if peak_only and (min(i, j) == 0 or max(i, j) == n_side - 1):
             return math.nan, math.nan  # no peak within reach, only a trend
         peak_only = False
+        step = float(steps[1] - steps[0])
+        if cell <= finest and step <= FINEST_STEP:
+            off_a, off_b = _top_of(steps, score)
+            return a + off_a, b + off_b
         a, b = a + float(steps[i]), b + float(steps[j])
-        if cell <= finest:
-            return a, b
-        width = 1.5 * float(steps[1] - steps[0])
+        # Low things come to the finest cell early: then only the angles go on narrowing
+        width = step if cell <= finest else 1.5 * step
         cell = max(0.5 * cell, finest)
+
+
+def _top_of(steps: Float64s, score: Float64s) -> tuple[float, float]:
+    """Return where a paraboloid fitted to a square grid of scores peaks, kept within the grid."""
+    x, y = (g.ravel() for g in np.meshgrid(steps, steps, indexing="ij"))
+    s = steps[-1]
+    A = np.column_stack([np.ones(x.size), x / s, y / s, (x / s) ** 2, x * y / s**2, (y / s) ** 2])
+    _, p, q, u, v, w = np.linalg.lstsq(A, score.ravel() / score.max(), rcond=None)[0]
+    determinant = 4.0 * u * w - v * v
+    if u >= 0.0 or determinant <= 0.0:
+        i, j = np.unravel_index(int(np.argmax(score)), score.shape)
+        return float(steps[i]), float(steps[j])
+    top_a, top_b = (v * q - 2.0 * w * p) / determinant, (v * p - 2.0 * u * q) / determinant
+    return float(s * np.clip(top_a, -1.0, 1.0)), float(s * np.clip(top_b, -1.0, 1.0))
 
 
 def _scatter_of_parts(xyz: Float64s, a: float, b: float) -> float:
@@ -143,16 +163,20 @@ def _scatter_of_parts(xyz: Float64s, a: float, b: float) -> float:
 
 @numba.njit(cache=True)  # type: ignore[misc]
 def _shared_pairs(xyz, a, b, cell):  # type: ignore[no-untyped-def]
-    """Return how many pairs of points share a plan cell, seen along the direction (a, b, 1)."""
+    """Return how many pairs of points share a plan cell, seen along the direction (a, b, 1).
+
+    Counted on two grids half a cell apart: a wall on a border of one is within a cell of the other.
+    """
     n = 1024
-    count = np.zeros((n, n), np.int32)
     pairs = 0.0
     tan_a, tan_b = np.tan(a), np.tan(b)
-    for k in range(xyz.shape[0]):
-        i = int(np.floor((xyz[k, 0] - tan_a * xyz[k, 2]) / cell)) & (n - 1)
-        j = int(np.floor((xyz[k, 1] - tan_b * xyz[k, 2]) / cell)) & (n - 1)
-        pairs += count[i, j]
-        count[i, j] += 1
+    for shift in (0.0, 0.5):
+        count = np.zeros((n, n), np.int32)
+        for k in range(xyz.shape[0]):
+            i = int(np.floor((xyz[k, 0] - tan_a * xyz[k, 2]) / cell + shift)) & (n - 1)
+            j = int(np.floor((xyz[k, 1] - tan_b * xyz[k, 2]) / cell + shift)) & (n - 1)
+            pairs += count[i, j]
+            count[i, j] += 1
     return pairs
 
 

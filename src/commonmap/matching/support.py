@@ -54,7 +54,7 @@ def measure_support(
     evidence, weight, ij = evidence[heard], weight[heard], ij[heard]
     total = float(evidence.sum())
     if len(evidence) < 2 or total <= 0:
-        return Support(evidence, weight, target.origin + ij, 0.0, 0.0, 0.0, 0.0)
+        return Support(evidence, weight, target.origin + ij * target.cell, 0.0, 0.0, 0.0, 0.0)
     se = float(evidence.std(ddof=1) * np.sqrt(len(evidence)))
     best_quarter = np.sort(evidence)[::-1][: -(-len(evidence) // 4)]
     return Support(

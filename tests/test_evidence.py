@@ -1,0 +1,366 @@
+"""Evidence: the 2x2 table by hand, the FFT against brute force, packing, and support by areas."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from commonmap.matching.evidence import (
+    Columns,
+    SlabGrid,
+    coarsen,
+    count_tables,
+    evidence_surface,
+    list_columns,
+    pack_slabs,
+    scatter,
+    signed_evidence,
+    transform_target,
+    unpack,
+    xlogx_table,
+)
+from commonmap.matching.search import evidence_at
+from commonmap.matching.support import measure_support
+from commonmap.metrics.formulas import evidence_direct, mutual_information
+from commonmap.metrics.table import METRICS
+from commonmap.types import Bools, Float64s
+
+SIZES = [
+    ((7, 11), (3, 5)),
+    ((13, 5), (4, 4)),
+    ((6, 6), (6, 6)),
+    ((1, 9), (2, 3)),
+    ((5, 8), (9, 13)),
+    ((17, 19), (1, 1)),
+]
+
+
+def random_slabs(
+    rng: np.random.Generator, n_slabs: int, shape: tuple[int, int], *, shared: bool
+) -> tuple[Bools, Bools]:
+    """Return (occupied, known) of (n_slabs, *shape), the known mask shared by the slabs or not."""
+    known = rng.random((1 if shared else n_slabs, *shape)) < 0.7
+    known = np.broadcast_to(known, (n_slabs, *shape)).copy()
+    occupied = known & (rng.random((n_slabs, *shape)) < rng.uniform(0.1, 0.6, (n_slabs, 1, 1)))
+    return occupied, known
+
+
+def packed(occupied: Bools, known: Bools, cell: float = 1.0) -> SlabGrid:
+    """Return the slabs as a grid that starts at the origin."""
+    return pack_slabs(np.zeros(2), cell, occupied, known)
+
+
+def shifted(layers: Bools, u: int, v: int, shape: tuple[int, int]) -> Bools:
+    """Return the source's layers laid on a target of that shape, cell [0, 0] on [u, v]."""
+    out = np.zeros((len(layers), *shape), bool)
+    for i in range(layers.shape[1]):
+        for j in range(layers.shape[2]):
+            if 0 <= i + u < shape[0] and 0 <= j + v < shape[1]:
+                out[:, i + u, j + v] = layers[:, i, j]
+    return out
+
+
+def test_a_table_worked_by_hand() -> None:
+    # 10 pairs: both 3, source alone 1, target alone 1, neither 5; margins 4 and 4
+    by_hand = 3 * math.log(30 / 16) + 2 * math.log(10 / 24) + 5 * math.log(50 / 36)
+    assert by_hand == pytest.approx(1.77740, abs=1e-5)
+    assert signed_evidence(10, 4, 4, 3, xlogx_table(11)) == pytest.approx(by_hand, abs=1e-12)
+    # 0 both, 5 and 5 alone, neither 0: perfect contradiction, -10 ln 2
+    assert signed_evidence(10, 5, 5, 0, xlogx_table(11)) == pytest.approx(-10 * math.log(2))
+    assert signed_evidence(10, 5, 5, 5, xlogx_table(11)) == pytest.approx(10 * math.log(2))
+    # independent: 2 of 4 in each row
+    assert signed_evidence(8, 4, 4, 2, xlogx_table(9)) == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("table", [(0, 0, 0, 0), (5, 0, 3, 0), (5, 5, 2, 2), (5, 2, 5, 2)])
+def test_a_side_that_never_varies_says_nothing(table: tuple[int, int, int, int]) -> None:
+    assert signed_evidence(*table, xlogx_table(6)) == 0.0
+
+
+def test_xlogx_is_zero_at_zero_and_at_one() -> None:
+    assert xlogx_table(3) == pytest.approx([0.0, 0.0, 2 * math.log(2), 3 * math.log(3)])
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(*[st.integers(0, 30)] * 4)
+def test_evidence_is_n_times_mutual_information(n11: int, n10: int, n01: int, n00: int) -> None:
+    n = n11 + n10 + n01 + n00
+    if n == 0:
+        return
+    s = np.repeat([1, 1, 0, 0], [n11, n10, n01, n00]).astype(float)
+    t = np.repeat([1, 0, 1, 0], [n11, n10, n01, n00]).astype(float)
+    expected = n * mutual_information(s, t) * np.sign(n11 * n00 - n10 * n01)
+    got = signed_evidence(n, n11 + n10, n11 + n01, n11, xlogx_table(n + 1))
+    assert got == pytest.approx(expected, abs=1e-9)
+
+
+def test_the_row_of_the_table_is_the_oracle_used_here() -> None:
+    assert METRICS["evidence"].direct is evidence_direct
+    assert METRICS["evidence"].maximise
+
+
+@pytest.mark.parametrize(("target_shape", "source_shape"), SIZES)
+@pytest.mark.parametrize("shared", [(True, True), (False, False), (True, False), (False, True)])
+def test_the_surface_equals_brute_force_at_every_shift(
+    target_shape: tuple[int, int], source_shape: tuple[int, int], shared: tuple[bool, bool]
+) -> None:
+    rng = np.random.default_rng(sum(target_shape) * 31 + sum(source_shape))
+    o_t, k_t = random_slabs(rng, 3, target_shape, shared=shared[0])
+    o_s, k_s = random_slabs(rng, 3, source_shape, shared=shared[1])
+    spectra = transform_target(packed(o_t, k_t), source_shape, workers=1)
+    source = packed(o_s, k_s)
+    score, overlap = evidence_surface(
+        spectra, source.occupied, source.known, min_overlap=1.0, workers=1
+    )
+    sx, sy = source_shape
+    assert score.shape == (target_shape[0] + sx - 1, target_shape[1] + sy - 1)
+    for u in range(score.shape[0]):
+        for v in range(score.shape[1]):
+            lay_o = shifted(o_s, u - (sx - 1), v - (sy - 1), target_shape)
+            lay_k = shifted(k_s, u - (sx - 1), v - (sy - 1), target_shape)
+            pairs = (lay_k & k_t).sum(axis=(1, 2)).max()
+            assert overlap[u, v] == pairs
+            if pairs < 1:
+                assert score[u, v] == -np.inf
+                continue
+            expected = evidence_direct(lay_o, lay_k, o_t, k_t)
+            assert score[u, v] == pytest.approx(expected, abs=1e-4)
+
+
+def test_the_surface_peaks_where_the_source_was_cut_out() -> None:
+    # not symmetric in x and y: the source is target[5:9, 2:5]
+    rng = np.random.default_rng(1)
+    o_t, k_t = random_slabs(rng, 4, (16, 9), shared=True)
+    k_t[:] = True
+    source = packed(o_t[:, 5:12, 2:7], k_t[:, 5:12, 2:7])
+    score, _ = evidence_surface(
+        transform_target(packed(o_t, k_t), (7, 5), workers=1),
+        source.occupied, source.known, min_overlap=20.0, workers=1,
+    )  # fmt: skip
+    u, v = np.unravel_index(int(np.argmax(score)), score.shape)
+    assert (u - 6, v - 4) == (5, 2)
+
+
+def test_shifts_with_too_few_pairs_cannot_win() -> None:
+    rng = np.random.default_rng(2)
+    o_t, k_t = random_slabs(rng, 2, (8, 8), shared=True)
+    o_s, k_s = random_slabs(rng, 2, (5, 5), shared=True)
+    source = packed(o_s, k_s)
+    spectra = transform_target(packed(o_t, k_t), (5, 5), workers=1)
+    score, overlap = evidence_surface(
+        spectra, source.occupied, source.known, min_overlap=6.5, workers=1
+    )
+    assert np.array_equal(np.isfinite(score), overlap >= 6.5)
+    assert 0 < np.isfinite(score).sum() < score.size
+
+
+def test_workers_do_not_change_a_bit() -> None:
+    rng = np.random.default_rng(3)
+    o_t, k_t = random_slabs(rng, 5, (37, 41), shared=False)
+    o_s, k_s = random_slabs(rng, 5, (19, 23), shared=False)
+    source = packed(o_s, k_s)
+    found = [
+        evidence_surface(
+            transform_target(packed(o_t, k_t), (19, 23), workers=n),
+            source.occupied, source.known, min_overlap=5.0, workers=n,
+        )
+        for n in (1, 2, 3)
+    ]  # fmt: skip
+    assert found[0][0].tobytes() == found[1][0].tobytes() == found[2][0].tobytes()
+    assert found[0][1].tobytes() == found[1][1].tobytes() == found[2][1].tobytes()
+
+
+def test_large_maps_keep_whole_counts() -> None:
+    # single precision: the counts of a full 300 x 300 overlap still round to whole numbers
+    rng = np.random.default_rng(4)
+    o_t, k_t = random_slabs(rng, 1, (300, 300), shared=True)
+    grid = packed(o_t, k_t)
+    spectra = transform_target(grid, (300, 300), workers=1)
+    score, overlap = evidence_surface(
+        spectra, grid.occupied, grid.known, min_overlap=100.0, workers=1
+    )
+    assert overlap[299, 299] == k_t.sum()
+    assert score[299, 299] == pytest.approx(evidence_direct(o_t, k_t, o_t, k_t), rel=1e-6)
+    assert overlap[299, 300] == (k_t[0, :, 1:] & k_t[0, :, :-1]).sum()
+
+
+def test_slab_k_is_bit_k_and_what_is_occupied_is_known() -> None:
+    occupied = np.zeros((3, 2, 2), bool)
+    known = np.zeros((3, 2, 2), bool)
+    occupied[2, 0, 1] = True  # not said to be known
+    known[0, 1, 0] = True
+    grid = pack_slabs(np.array([5.0, 6.0]), 0.5, occupied, known)
+    assert grid.occupied.tolist() == [[0, 4], [0, 0]]
+    assert grid.known.tolist() == [[0, 4], [1, 0]]
+    assert (grid.n_slabs, grid.cell, grid.origin.tolist()) == (3, 0.5, [5.0, 6.0])
+
+
+def test_unpack_is_the_inverse_of_pack() -> None:
+    rng = np.random.default_rng(5)
+    occupied, known = random_slabs(rng, 32, (5, 7), shared=False)
+    grid = packed(occupied, known)
+    slabs = np.arange(32, dtype=np.uint32)
+    out = unpack(grid.occupied, slabs, 8, 9)
+    assert np.array_equal(out[:, :5, :7], occupied.astype(np.float32))
+    assert out[:, 5:].sum() == 0 and out[:, :, 7:].sum() == 0
+    assert np.array_equal(unpack(grid.known, slabs, 5, 7), known.astype(np.float32))
+
+
+def test_coarse_cells_are_aligned_to_their_own_width() -> None:
+    # cells of 0.5 m from x = 1.5 and y = -1.0; of 1 m: [1, 2) holds cell 0, [2, 3) cells 1 and 2
+    bits = np.array([[1], [2], [4], [8]], np.uint32)
+    coarse = coarsen(SlabGrid(np.array([1.5, -1.0]), 0.5, bits, bits, 4), 2)
+    assert coarse.cell == 1.0
+    assert coarse.origin.tolist() == [1.0, -1.0]
+    assert coarse.occupied.tolist() == [[1], [6], [8]]
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(st.integers(0, 2**31), st.sampled_from([1, 2, 3, 4]), st.integers(-9, 9), st.integers(-9, 9))
+def test_coarsen_equals_its_slow_twin(seed: int, factor: int, i0: int, j0: int) -> None:
+    rng = np.random.default_rng(seed)
+    shape = (int(rng.integers(1, 9)), int(rng.integers(1, 9)))
+    occupied, known = random_slabs(rng, 3, shape, shared=False)
+    grid = pack_slabs(np.array([i0, j0]) * 0.25, 0.25, occupied, known)
+    coarse = coarsen(grid, factor)
+    expected: dict[tuple[int, int], list[int]] = {}
+    for i in range(shape[0]):
+        for j in range(shape[1]):
+            bits = expected.setdefault(((i0 + i) // factor, (j0 + j) // factor), [0, 0])
+            bits[0] |= int(grid.occupied[i, j])
+            bits[1] |= int(grid.known[i, j])
+    a0, b0 = np.round(coarse.origin / coarse.cell).astype(int)
+    assert coarse.origin == pytest.approx(np.array([a0, b0]) * coarse.cell)
+    assert coarse.cell == 0.25 * factor
+    for a in range(coarse.shape[0]):
+        for b in range(coarse.shape[1]):
+            bits = expected.pop((a0 + a, b0 + b), [0, 0])
+            assert [coarse.occupied[a, b], coarse.known[a, b]] == bits
+    assert not expected
+
+
+def test_columns_are_the_centres_of_the_known_cells() -> None:
+    occupied = np.zeros((1, 2, 3), bool)
+    known = np.zeros((1, 2, 3), bool)
+    known[0, 0, 2] = known[0, 1, 0] = occupied[0, 1, 0] = True
+    columns = list_columns(pack_slabs(np.array([10.0, 20.0]), 2.0, occupied, known))
+    assert columns.xy.tolist() == [[11.0, 25.0], [13.0, 21.0]]
+    assert columns.occupied.tolist() == [0, 1]
+    assert columns.known.tolist() == [1, 1]
+
+
+def test_scatter_turns_x_towards_y() -> None:
+    xy = np.array([[2.5, 0.5], [2.6, 0.4], [-50.0, 0.0]])
+    occupied, known = scatter(
+        xy, np.array([1, 4, 8], np.uint32), np.array([3, 4, 8], np.uint32),
+        0.0, 1.0, 1.0, np.array([-3.0, 0.0]), 4, 4,
+    )  # fmt: skip
+    # a quarter turn takes (2.5, 0.5) to (-0.5, 2.5): cell [2, 2] from the corner (-3, 0)
+    assert np.argwhere(known).tolist() == [[2, 2]]
+    assert known[2, 2] == 7
+    assert occupied[2, 2] == 5
+
+
+def tables_by_hand(grid: SlabGrid, columns: Columns, pose: Float64s) -> list[list[int]]:
+    """Return the n, n_1, n_2, n11 of every slab, cell by cell in Python."""
+    cells: dict[tuple[int, int], list[int]] = {}
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    for (x, y), occupied, known in zip(
+        columns.xy.tolist(), columns.occupied, columns.known, strict=True
+    ):
+        i = math.floor((c * x - s * y + pose[0] - grid.origin[0]) / grid.cell)
+        j = math.floor((s * x + c * y + pose[1] - grid.origin[1]) / grid.cell)
+        bits = cells.setdefault((i, j), [0, 0])
+        bits[0] |= int(occupied)
+        bits[1] |= int(known)
+    table = [[0, 0, 0, 0] for _ in range(grid.n_slabs)]
+    for (i, j), (occupied, known) in cells.items():
+        if not (0 <= i < grid.shape[0] and 0 <= j < grid.shape[1]):
+            continue
+        for k in range(grid.n_slabs):
+            if known >> k & 1 and int(grid.known[i, j]) >> k & 1:
+                mine, other = occupied >> k & 1, int(grid.occupied[i, j]) >> k & 1
+                for n, add in enumerate((1, mine, other, mine & other)):
+                    table[k][n] += add
+    return table
+
+
+def test_count_tables_equals_its_slow_twin() -> None:
+    rng = np.random.default_rng(6)
+    o_t, k_t = random_slabs(rng, 3, (20, 14), shared=False)
+    grid = pack_slabs(np.array([-4.0, 7.0]), 0.5, o_t, k_t)
+    o_s, k_s = random_slabs(rng, 3, (18, 26), shared=False)
+    columns = list_columns(pack_slabs(np.array([-2.0, -3.0]), 0.25, o_s, k_s))
+    poses = np.column_stack(
+        [rng.uniform(-8, 10, 40), rng.uniform(3, 18, 40), rng.uniform(-7, 7, 40)]
+    )
+    tables = count_tables(
+        grid.occupied, grid.known, grid.origin, grid.cell, columns.xy, columns.occupied,
+        columns.known, 3, poses,
+    )  # fmt: skip
+    for pose, table in zip(poses, tables, strict=True):
+        assert table.tolist() == tables_by_hand(grid, columns, pose)
+    assert tables[:, :, 0].max() > 20
+
+
+def test_one_pose_by_counting_equals_the_surface() -> None:
+    # at a shift of whole cells, the pose by pose count and the FFT say the same
+    rng = np.random.default_rng(7)
+    o_t, k_t = random_slabs(rng, 3, (15, 12), shared=True)
+    grid = packed(o_t, k_t, cell=1.0)
+    o_s, k_s = random_slabs(rng, 3, (12, 12), shared=True)
+    columns = list_columns(pack_slabs(np.array([-3.0, -3.0]), 0.5, o_s, k_s))
+    yaw, side, low = 0.8, 12, np.array([-6.0, -6.0])
+    occupied, known = scatter(
+        columns.xy, columns.occupied, columns.known, math.cos(yaw), math.sin(yaw), 1.0, low,
+        side, side,
+    )  # fmt: skip
+    score, overlap = evidence_surface(
+        transform_target(grid, (side, side), workers=1), occupied, known,
+        min_overlap=1.0, workers=1,
+    )  # fmt: skip
+    for u, v in [(11, 11), (14, 12), (16, 18), (20, 9)]:
+        pose = np.array([u - (side - 1) - low[0], v - (side - 1) - low[1], yaw])
+        evidence, pairs = evidence_at(grid, columns, pose)
+        assert evidence == pytest.approx(float(score[u, v]), abs=1e-4)
+        assert pairs == overlap[u, v]
+
+
+def test_support_of_a_true_pose_and_of_a_half_true_one() -> None:
+    rng = np.random.default_rng(8)
+    o_t = rng.random((3, 64, 64)) < 0.2
+    k_t = np.ones_like(o_t)
+    grid = packed(o_t, k_t)
+    same = list_columns(grid)
+    pose = np.zeros(3)
+    true = measure_support(grid, same, pose)
+    assert true.share == pytest.approx(1.0)
+    assert true.effect == pytest.approx(1.0, abs=0.02)
+    assert true.spread == pytest.approx(0.75, abs=0.05)
+    assert true.weight.shape == true.evidence.shape == (64,)
+    # the upper half of the source saw another place
+    wrong = o_t.copy()
+    wrong[:, :, 32:] = rng.random((3, 64, 32)) < 0.2
+    half = measure_support(grid, list_columns(packed(wrong, k_t)), pose)
+    assert half.share < 0.75
+    upper = half.xy[:, 1] > 32.0
+    assert half.evidence[~upper].min() > 0.0
+    assert half.evidence[upper].sum() < 0.2 * half.evidence[~upper].sum()
+    assert half.t < true.t
+
+
+def test_areas_of_the_support_sum_to_the_evidence() -> None:
+    rng = np.random.default_rng(9)
+    o_t, k_t = random_slabs(rng, 2, (60, 60), shared=True)
+    noisy = o_t ^ ((rng.random(o_t.shape) < 0.1) & k_t)
+    grid = packed(o_t, k_t)
+    source = list_columns(packed(noisy, k_t))
+    support = measure_support(grid, source, np.zeros(3))
+    # the table starts at half a pair in each of its cells, so the sums agree but for that
+    assert support.evidence.sum() == pytest.approx(
+        evidence_at(grid, source, np.zeros(3))[0], rel=0.01
+    )
