@@ -117,7 +117,7 @@ def test_levelling_is_deterministic(town: Float64s) -> None:
 
 def test_where_the_map_lies_does_not_matter(town: Float64s) -> None:
     tilted = town @ tilt_about(5.0, 0.9).T
-    near, far = find_level(tilted), find_level(tilted + [1000.0, -2000.0, 500.0])
+    near, far = find_level(tilted), find_level(np.add(tilted, (1000.0, -2000.0, 500.0)))
     assert far.T_level_map == pytest.approx(near.T_level_map, abs=1e-3)
 
 
