@@ -354,13 +354,23 @@ def _read_both(base: Path, draft: Path, progress: Any) -> tuple[Cloud | Leaves, 
 
 
 def _say_match(match: Match) -> None:
+    from commonmap.frames import apply, invert
     from commonmap.report.pose import pose_figures, sigma_figures
 
     print(match.reason)
     if match.T_target_source is None:
         return
     pose = pose_figures(match.T_target_source)
-    print(f"draft in base: x {pose.x:.3f} m, y {pose.y:.3f} m, z {pose.z:.3f} m")
+    print(f"draft's origin in base: x {pose.x:.3f} m, y {pose.y:.3f} m, z {pose.z:.3f} m")
+    if match.covariance_centre is not None:
+        # Far from its origin a small turn moves a map by much: say where the map itself lies
+        here = match.covariance_centre
+        there = apply(invert(match.T_target_source), here[None])[0]
+        print(
+            "  the draft's point {:.2f}, {:.2f}, {:.2f} lies at {:.2f}, {:.2f}, {:.2f}".format(
+                *there, *here
+            )
+        )
     print(
         f"  yaw {pose.yaw_deg:.3f}, pitch {pose.pitch_deg:.3f}, roll {pose.roll_deg:.3f} degrees; "
         f"confidence {math.floor(1000 * match.confidence) / 10:.1f} %, "
