@@ -1,10 +1,11 @@
 """Accepted or refused, with the reason. A wrong answer accepted is the worst there is.
 
 The figures compare the best pose with what chance reaches in the very same maps: the best pose of
-the mirrored source (the decoy) and the best pose elsewhere (the second). They look at how many
-areas of the source speak for the pose, and at how the points lie after the refinement, against how
-they lie at the decoy's pose. A logistic model, fitted to simulated pairs of many kinds
-(docs/decision.md), makes one probability of them.
+the mirrored source (the decoy), the best pose elsewhere (the second), the best poses of all other
+headings; and with how the points lie on each other at the decoy's pose. A logistic model, fitted to
+simulated pairs of many kinds (`benchmarks/decision.py`, docs/decision.md), makes one probability of
+them. Two things no probability makes up for: a refinement that left the peak, and too little
+evidence to fix a pose.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from dataclasses import asdict, dataclass
 class Figures:
     """What the verdict rests on.
 
+    evidence: nats, at the best pose.
     decoy_ratio: evidence of the best pose over that of the mirrored source's best pose.
     second_ratio: evidence of the best pose over that of the best pose elsewhere.
     prominence: best pose over the median of all yaws' bests, in robust standard deviations.
@@ -32,6 +34,7 @@ class Figures:
     converged: 1 where the refinement stayed in the basin of the search's peak.
     """
 
+    evidence: float
     decoy_ratio: float
     second_ratio: float
     prominence: float
@@ -63,26 +66,21 @@ class Verdict:
 ACCEPT_AT = 0.9
 """Probability from which a pose is accepted."""
 
-WEIGHTS = {
-    "bias": -7.0,
-    "decoy": 4.0,
-    "second": 4.0,
-    "support": 2.0,
-    "spread": 3.0,
-    "inliers": 6.0,
-}
+LEAST_EVIDENCE = 100.0
+"""Evidence in nats under which no pose is accepted. Neighbouring cells say much the same, so an
+independent tenth of it is left, which chance among a million poses reaches once in a while."""
+
+WEIGHTS = {"bias": -7.7, "ratios": 3.07, "prominence": 2.53, "inliers": 3.52}
 """Of the logistic model; see `features`."""
 
 
 def features(figures: Figures) -> dict[str, float]:
-    """Return what the logistic model sees: logarithms of ratios, bounded, and shares."""
+    """Return what the logistic model sees: logarithms of bounded ratios, and a bounded share."""
     return {
         "bias": 1.0,
-        "decoy": _log(figures.decoy_ratio),
-        "second": _log(figures.second_ratio),
-        "support": figures.support,
-        "spread": max(figures.spread, -0.5),
-        "inliers": figures.inliers - figures.decoy_inliers,
+        "ratios": _log(figures.decoy_ratio) + _log(figures.second_ratio),
+        "prominence": math.log(max(figures.prominence, 1.0)),
+        "inliers": min(max(figures.inliers - figures.decoy_inliers, -0.2), 0.3),
     }
 
 
@@ -94,6 +92,13 @@ def decide(figures: Figures) -> Verdict:
     if not figures.converged:
         confidence = min(confidence, 0.5)
         reason = "refused: the refinement on the points left the place that the search had found"
+        return Verdict(False, confidence, reason)
+    if figures.evidence < LEAST_EVIDENCE:
+        confidence = min(confidence, 0.5)
+        reason = (
+            f"refused: the best pose has only {figures.evidence:.0f} nats of evidence, too little "
+            f"to rely on (at least {LEAST_EVIDENCE:.0f} are needed)"
+        )
         return Verdict(False, confidence, reason)
     if confidence >= ACCEPT_AT and figures.decoy_ratio > 1.0 and figures.second_ratio > 1.0:
         return Verdict(

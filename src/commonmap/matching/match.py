@@ -253,7 +253,7 @@ def measure_figures(
     witness, decoy: peaks of the evidence, of the source as it is and mirrored.
     """
     if refined is None or len(found.score) == 0:
-        return Figures(0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
+        return Figures(*[0.0] * 14)
     grid = coarsen(base_layers.slabs, 2)
     columns = _about(list_columns(draft_layers.slabs), found.centre, mirrored=False)
     best_score, n_overlap = evidence_at(grid, columns, found.pose[0])
@@ -284,6 +284,7 @@ def measure_figures(
             draft_layers.standing, reach,
         )  # fmt: skip
     return Figures(
+        evidence=best_score,
         decoy_ratio=best_score / max(decoy_score, 1e-9),
         second_ratio=best_score / max(second_score, 1e-9),
         prominence=(float(yaw_best.max()) - middle) / max(spread, 1e-9),
