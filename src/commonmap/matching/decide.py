@@ -70,7 +70,7 @@ LEAST_EVIDENCE = 100.0
 """Evidence in nats under which no pose is accepted. Neighbouring cells say much the same, so an
 independent tenth of it is left, which chance among a million poses reaches once in a while."""
 
-WEIGHTS = {"bias": -7.7, "ratios": 3.07, "prominence": 2.53, "inliers": 3.52}
+WEIGHTS = {"bias": -8.2, "ratios": 3.1, "prominence": 2.75, "inliers": 3.4}
 """Of the logistic model; see `features`."""
 
 

@@ -1,0 +1,175 @@
+"""How far the verdict can be trusted: collect simulated cases, fit the model, show what it does.
+
+    python benchmarks/decision.py collect --first 0 --pairs 60     # appends to records/decision.jsonl
+    python benchmarks/decision.py fit                              # prints the weights for decide.py
+    python benchmarks/decision.py show [--from 1000]               # success, refusals, false accepts
+
+A case is a pair of robots in one simulated place (overlap 0.12 to 1, drift 0 to 1 %, tilt to 1
+degree, up to 30 % of the objects changed), or a draft of another place of the same or another kind.
+Every second case uses only heights under 1 m. Fit and show never use the same seeds: the fit takes
+those below 1000.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize
+
+from commonmap.config import Config
+from commonmap.frames import difference
+from commonmap.matching.decide import ACCEPT_AT, LEAST_EVIDENCE, Figures, features
+from commonmap.matching.match import match
+from commonmap.sim.pairs import simulate_pair
+from commonmap.version import __version__
+
+KINDS = ("paper", "city", "forest", "village", "industrial", "field")
+RECORDS = Path(__file__).parent / "records" / "decision.jsonl"
+FIT_BELOW = 1000
+RIGHT = (1.0, np.radians(2.0))
+
+
+def simulate(seed: int) -> tuple[dict[str, Any], Any]:
+    """Return (conditions, pair) of a seed."""
+    rng = np.random.default_rng(seed)
+    conditions: dict[str, Any] = {
+        "overlap": float(rng.choice([1, 0.7, 0.45, 0.3, 0.2, 0.15])),
+        "drift": float(rng.choice([0, 0.003, 0.01])),
+        "tilt": float(np.radians(rng.choice([0, 0.5, 1.0]))),
+        "change": float(rng.choice([0, 0.3])),
+    }
+    kind = KINDS[seed % len(KINDS)]
+    pair = simulate_pair(kind, rng=rng, max_points=500_000, **conditions)
+    return {"kind": kind, **conditions, "overlap": pair.overlap}, pair
+
+
+def collect(first: int, n_pairs: int) -> None:
+    """Append the cases of `n_pairs` seeds to the records."""
+    logging.getLogger("commonmap").setLevel(logging.ERROR)
+    earlier: dict[str, Any] = {}
+    RECORDS.parent.mkdir(exist_ok=True)
+    with RECORDS.open("a") as out:
+        for seed in range(first, first + n_pairs):
+            conditions, pair = simulate(seed)
+            kind = conditions["kind"]
+            other = KINDS[(seed // 6 + seed) % len(KINDS)]
+            cases = [("same place", pair.source.xyz, pair.T_target_source)]
+            if kind in earlier:
+                cases.append(("same kind", earlier[kind], None))
+            if seed % 3 == 0 and other in earlier and other != kind:
+                cases.append(("other kind", earlier[other], None))
+            for n, (label, source, truth) in enumerate(cases):
+                max_height = 1.0 if (seed + n) % 2 else None
+                config = Config().with_values(grid={"max_height": max_height})
+                start = time.perf_counter()
+                found = match(pair.target.xyz, source, config=config)
+                record = {
+                    "version": __version__, "seed": seed, "label": label, **conditions,
+                    "max_height": max_height, "accepted": found.accepted,
+                    "confidence": found.confidence, "seconds": time.perf_counter() - start,
+                    "figures": dict(found.evidence),
+                }  # fmt: skip
+                if truth is not None:
+                    best = found.T_target_source
+                    if best is None:
+                        best = found.rivals[0].T_target_source
+                    metres, radians = difference(best, truth, source.mean(axis=0))
+                    record |= {"metres": metres, "radians": radians}
+                    record["right"] = bool(metres < RIGHT[0] and radians < RIGHT[1])
+                else:
+                    record["right"] = False
+                out.write(json.dumps(record) + "\n")
+                out.flush()
+                print(seed, kind, label, max_height, "accepted" if found.accepted else "refused",
+                      "right" if record["right"] else "-", f"{found.confidence:.3f}", flush=True)
+            earlier[kind] = pair.source.xyz
+
+
+def load(first: int, last: int) -> list[dict[str, Any]]:
+    """Return the records of the seeds from `first` up to, not including, `last`."""
+    records = [json.loads(line) for line in RECORDS.read_text().splitlines()]
+    return [r for r in records if first <= r["seed"] < last]
+
+
+def design(records: list[dict[str, Any]]) -> tuple[list[str], np.ndarray, np.ndarray]:
+    """Return (names, X, y) of the logistic model."""
+    rows = []
+    for record in records:
+        values = {k: v for k, v in record["figures"].items() if k in Figures.__annotations__}
+        values.setdefault("evidence", record.get("score", 1000.0))
+        rows.append(features(Figures(**values)))
+    X = np.array([list(row.values()) for row in rows])
+    return list(rows[0]), X, np.array([record["right"] for record in records], dtype=float)
+
+
+def fit() -> None:
+    """Print the weights: ridge-regularised logistic regression."""
+    records = load(0, FIT_BELOW)
+    # Found the place but is off by a little more than allowed: neither right nor wrong
+    records = [r for r in records if r["right"] or r.get("metres", 99.0) > 1.5]
+    names, X, y = design(records)
+
+    def loss(w: np.ndarray) -> float:
+        z = X @ w
+        return float(np.sum(np.logaddexp(0, z) - y * z) + 0.1 * np.sum(w[1:] ** 2))
+
+    w = minimize(loss, np.zeros(X.shape[1]), method="BFGS").x
+    p = 1.0 / (1.0 + np.exp(-X @ w))
+    print(dict(zip(names, w.round(2).tolist(), strict=True)), f"from {len(y)} cases")
+    print("highest p of the wrong:", np.sort(p[y == 0])[-5:].round(3))
+    print("lowest p of the right:", np.sort(p[y == 1])[:8].round(3))
+
+
+def show(first: int) -> None:
+    """Print what today's model does on the seeds from `first` on."""
+    records = load(first, 1 << 40)
+    names, X, _ = design(records)
+    from commonmap.matching.decide import WEIGHTS
+
+    p = 1.0 / (1.0 + np.exp(-X @ np.array([WEIGHTS[n] for n in names])))
+    accepted = np.array([
+        pi >= ACCEPT_AT and r["figures"]["converged"] > 0
+        and r["figures"].get("evidence", r.get("score", 1e3)) >= LEAST_EVIDENCE
+        for pi, r in zip(p, records, strict=True)
+    ])  # fmt: skip
+    right = np.array([r["right"] for r in records])
+    same = np.array([r["label"] == "same place" for r in records])
+    print(f"{len(records)} cases, {same.sum()} of the same place, {(~same).sum()} of others")
+    print(f"same place: best pose right {right.sum()}, accepted and right {(accepted & right).sum()}")
+    print(f"accepted and wrong: {(accepted & ~right).sum()}")
+    for kind in KINDS:
+        k = np.array([r["kind"] == kind for r in records])
+        print(f"  {kind:11s} same {(k & same).sum():3d}  right {(k & right).sum():3d}  "
+              f"accepted {(k & accepted & right).sum():3d}   other {(k & ~same).sum():3d}  "
+              f"accepted {(k & accepted & ~right).sum()}")
+    print("reliability: probability, cases, share right")
+    for low, high in ((0, 0.1), (0.1, 0.5), (0.5, 0.9), (0.9, 0.99), (0.99, 1.01)):
+        inside = (p >= low) & (p < high)
+        if inside.any():
+            print(f"  {low:.2f} to {min(high, 1):.2f}  {inside.sum():4d}  {right[inside].mean():.2f}")
+
+
+def main() -> None:
+    """Run the command named on the command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("job", nargs="?", default="show", choices=["collect", "fit", "show"])
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--pairs", type=int, default=60)
+    parser.add_argument("--from", dest="start", type=int, default=0)
+    options = parser.parse_args()
+    if options.job == "collect":
+        collect(options.first, options.pairs)
+    elif options.job == "fit":
+        fit()
+    else:
+        show(options.start)
+
+
+if __name__ == "__main__":
+    main()
