@@ -7,6 +7,7 @@ round before its transform, so that a plain product of spectra is a cross-correl
 from __future__ import annotations
 
 import importlib
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -71,20 +72,52 @@ def choose_shape(
     return lengths[0], lengths[1]
 
 
-def transform(arrays: Arrays, layers: Array, shape: tuple[int, int], workers: int) -> Array:
-    """Return the spectra of the layers, padded with zeros to `shape`; empty rows are skipped."""
+_own = threading.local()
+
+
+def borrow(arrays: Arrays, role: str, shape: tuple[int, ...], dtype: Any) -> Array:
+    """Return an array of this thread to write into, the same one again for the same role.
+
+    What a fresh array of many megabytes costs is not its values but its pages: a third of the time
+    of a score. The array is good until this thread borrows for that role again.
+    """
+    if arrays.name != "numpy" or not role:
+        return arrays.xp.empty(shape, dtype)
+    store = _own.__dict__
+    array = store.get(role)
+    if array is None or array.shape != shape or array.dtype != dtype:
+        array = store[role] = np.empty(shape, dtype)
+    return array
+
+
+def transform(
+    arrays: Arrays, layers: Array, shape: tuple[int, int], workers: int, role: str = ""
+) -> Array:
+    """Return the spectra of the layers, padded with zeros to `shape`; empty rows are skipped.
+
+    role: of the array to borrow for them; without one they have an array of their own.
+    """
     options = {"workers": workers} if arrays.threads else {}
-    rows = arrays.fft.rfft(layers, n=shape[1], axis=-1, **options)
-    return arrays.fft.fft(rows, n=shape[0], axis=-2, **options)
+    one = np.result_type(layers.dtype, np.complex64)
+    out = borrow(arrays, role, (layers.shape[0], shape[0], shape[1] // 2 + 1), one)
+    for k in range(layers.shape[0]):
+        rows = arrays.fft.rfft(layers[k], n=shape[1], axis=-1, **options)
+        out[k] = arrays.fft.fft(rows, n=shape[0], axis=-2, **options)
+    return out
 
 
-def invert(arrays: Arrays, spectra: Array, shape: tuple[int, int], workers: int) -> Array:
-    """Return the layers (m, Nx, Ny) of the spectra, which are overwritten."""
+def invert(
+    arrays: Arrays, spectra: Array, shape: tuple[int, int], workers: int, role: str = ""
+) -> Array:
+    """Return the layers (m, Nx, Ny) of the spectra, which are overwritten; role as above."""
     options: dict[str, Any] = {"overwrite_x": True}
     if arrays.threads:
         options["workers"] = workers
-    columns = arrays.fft.ifft(spectra, axis=-2, **options)
-    return arrays.fft.irfft(columns, n=shape[1], axis=-1, **options)
+    out = borrow(arrays, role, (spectra.shape[0], *shape), spectra.real.dtype)
+    for k in range(spectra.shape[0]):
+        columns = arrays.fft.ifft(spectra[k], axis=-2, **options)
+        out[k] = arrays.fft.irfft(columns, n=shape[1], axis=-1, **options)
+    return out
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract", "nsz"})
@@ -158,11 +191,11 @@ def multiply_add(
 ) -> list[Array]:
     """Return, per turn, the spectra `sum U[f] * W[w]` of each list of pairs (f, w).
 
-    W: as `pack` returns it. A half turn of the source conjugates U (up to a shift).
+    The spectra are borrowed. W: as `pack` returns it. A half turn conjugates U, up to a shift.
     """
     shape = (len(pairs), *U.shape[1:])
     if arrays.name == "numpy":
-        outs = {turn: np.empty(shape, U.dtype) for turn in turns}
+        outs = {turn: borrow(arrays, f"products {turn}", shape, U.dtype) for turn in turns}
         none = np.empty((0, *U.shape[1:]), U.dtype)
         flat = [pair for some in pairs for pair in some]
         first = np.cumsum([0, *(len(some) for some in pairs)])

@@ -93,7 +93,9 @@ def kernel_products(
         spectra.append(fourier.pack(frame.arrays, frame.target_spectra(stack, workers)))
         norms.append(norm(stack))
     W = frame.arrays.xp.concatenate(spectra)
-    return Kernel(plan, Products(frame, layers, W, tuple(pairs), np.concatenate(norms)), separated)
+    return Kernel(
+        plan, Products(frame, layers, W, tuple(pairs), np.concatenate(norms), "kernel"), separated
+    )
 
 
 @numba.njit(cache=True, nogil=True)

@@ -40,23 +40,24 @@ class Frame:
         """
         return 0.5 * float(np.finfo(self.dtype).eps) * float(np.log2(np.prod(self.shape)))
 
-    def source_spectra(self, layers: Float64s, workers: int) -> Array:
+    def source_spectra(self, layers: Float64s, workers: int, role: str = "") -> Array:
         """Return the spectra of the (m, sx, sy) layers of the source, turned round."""
         turned = np.ascontiguousarray(layers[:, ::-1, ::-1], dtype=self.dtype)
-        return fourier.transform(self.arrays, self.arrays.xp.asarray(turned), self.shape, workers)
+        placed = self.arrays.xp.asarray(turned)
+        return fourier.transform(self.arrays, placed, self.shape, workers, role)
 
     def target_spectra(self, layers: Float64s, workers: int) -> Array:
         """Return the spectra of the (m, tx, ty) layers of the target."""
         placed = self.arrays.xp.asarray(layers.astype(self.dtype))
         return fourier.transform(self.arrays, placed, self.shape, workers)
 
-    def correlate(self, spectra: Array, workers: int) -> Array:
+    def correlate(self, spectra: Array, workers: int, role: str = "") -> Array:
         """Return the correlations (m, Nx, Ny) of products of spectra, which are overwritten.
 
         [u, v] is the shift of the surface's [u, v], modulo the size of the transforms; where the
         source's spectra were conjugated for a half turn, `rows_of` says where a shift is.
         """
-        return fourier.invert(self.arrays, spectra, self.shape, workers)
+        return fourier.invert(self.arrays, spectra, self.shape, workers, role)
 
     def rows_of(self, shifts: Any, axis: int, *, turned: bool) -> Any:
         """Return the places along `axis` of the surface's shifts: a half turn moves them."""
@@ -94,7 +95,7 @@ class Products:
 
     layers: (h, known) -> the (m, sx, sy) source layers. spectra: of the target layers.
     packed, for `multiply_add`. pairs: per output, which source layer meets which target layer.
-    target_norm: of each target layer.
+    target_norm: of each target layer. role: under which the outputs are borrowed.
     """
 
     frame: Frame
@@ -102,6 +103,7 @@ class Products:
     spectra: Array
     pairs: tuple[tuple[tuple[int, int], ...], ...]
     target_norm: Float64s
+    role: str
 
     def correlate(
         self,
@@ -114,11 +116,12 @@ class Products:
     ) -> tuple[list[Array], Float64s]:
         """Return per turn the outputs (m, ...), and what rounding may have added to each, (m,).
 
+        The outputs are borrowed: good until the next call for the same role in this thread.
         turns: False for the source as it is, True for the source after half a turn.
         weights: per turn (m,), to sum the outputs to a single one before its inverse transform.
         """
         layers = self.layers(h, known)
-        U = self.frame.source_spectra(layers, workers)
+        U = self.frame.source_spectra(layers, workers, "source")
         outputs = fourier.multiply_add(self.frame.arrays, U, self.spectra, self.pairs, turns)
         norms = norm(layers)
         rounding = self.frame.rounding * np.array(
@@ -131,7 +134,11 @@ class Products:
                 for spectra, factor in zip(outputs, factors, strict=True)
             ]
             rounding = np.array([np.max(np.abs(np.stack(weights)), axis=0) @ rounding])
-        return [self.frame.correlate(spectra, workers) for spectra in outputs], rounding
+        surfaces = [
+            self.frame.correlate(spectra, workers, f"{self.role} {turn}")
+            for spectra, turn in zip(outputs, turns, strict=True)
+        ]
+        return surfaces, rounding
 
 
 def _evaluate(name: str, h: Float64s, known: Bools, unit: float) -> Float64s:
@@ -183,4 +190,4 @@ def moment_products(
         return np.stack([_evaluate(f, h, known, unit) for f in source_names])
 
     spectra = fourier.pack(frame.arrays, frame.target_spectra(stack, workers))
-    return Products(frame, layers, spectra, tuple(pairs), norm(stack))
+    return Products(frame, layers, spectra, tuple(pairs), norm(stack), "moments")
