@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from commonmap.types import Float64s
+from commonmap.types import Float64s, Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,13 +142,13 @@ def rigid(x: float, y: float, z: float, yaw: float) -> Float64s:
     return T
 
 
-def moved(T: Float64s, xyz: Float64s) -> Float64s:
+def moved(T: Floats, xyz: Floats) -> Float64s:
     """Return T applied to every point, one coordinate after the other."""
     h = np.column_stack([xyz, np.ones(len(xyz))])
     return np.column_stack([h @ T[0], h @ T[1], h @ T[2]])
 
 
-def apart(T_a: Float64s, T_b: Float64s, xyz: Float64s) -> tuple[float, float]:
+def apart(T_a: Floats, T_b: Floats, xyz: Floats) -> tuple[float, float]:
     """Return (metres, degrees): the largest distance over the points, and the turn between."""
     distance = np.linalg.norm(moved(T_a, xyz) - moved(T_b, xyz), axis=1).max()
     trace = float(np.trace(T_a[:3, :3].T @ T_b[:3, :3]))

@@ -142,7 +142,7 @@ def test_the_surface_peaks_where_the_source_was_cut_out() -> None:
         source.occupied, source.known, min_overlap=20.0, workers=1,
     )  # fmt: skip
     u, v = np.unravel_index(int(np.argmax(score)), score.shape)
-    assert (u - 6, v - 4) == (5, 2)
+    assert [int(u) - 6, int(v) - 4] == [5, 2]
 
 
 def test_shifts_with_too_few_pairs_cannot_win() -> None:

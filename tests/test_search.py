@@ -21,7 +21,7 @@ from commonmap.matching.search import (
     separate,
 )
 from commonmap.matching.search_metric import scatter_heights, search_metric
-from commonmap.types import Float64s, GridMap
+from commonmap.types import Float64s, Floats, GridMap
 from matching_scenes import apart, look, make_place, moved, rigid
 
 EDGES = np.array([0.25, 0.5, 1.0, 2.0, 4.0])
@@ -49,7 +49,7 @@ def small_pair(seed: int) -> tuple[Float64s, Float64s, Float64s]:
     return target, moved(np.linalg.inv(T), draft), T
 
 
-def planar_error(T: Float64s, T_true: Float64s, xyz: Float64s) -> tuple[float, float]:
+def planar_error(T: Floats, T_true: Floats, xyz: Floats) -> tuple[float, float]:
     """Return (metres at the middle of the points, degrees)."""
     middle = 0.5 * (xyz[:, :2].min(axis=0) + xyz[:, :2].max(axis=0))
     metres, degrees = apart(T, T_true, np.array([[*middle, 0.0]]))

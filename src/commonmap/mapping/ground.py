@@ -124,7 +124,7 @@ def _fit_plane(z: Float64s, known: Bools) -> Float64s:
     x: Float64s = np.zeros(3)
     for _ in range(4):
         N = (A * w[:, None]).T @ A + 1e-9 * len(i) * np.eye(3)
-        x = np.linalg.solve(N, (A * w[:, None]).T @ b)
+        x = np.asarray(np.linalg.solve(N, (A * w[:, None]).T @ b), dtype=np.float64)
         residual = b - A @ x
         scale = 1.4826 * float(np.median(np.abs(residual))) + 1e-3
         w = 1.0 / (1.0 + (residual / (2.0 * scale)) ** 2)

@@ -78,7 +78,7 @@ def refine(
     T_target_source: Float64s,
     *,
     cell: float,
-    threads: int = 2,
+    threads: int = 1,
     n_most: int = 40_000,
     settle: bool = True,
 ) -> Refined:
@@ -86,7 +86,7 @@ def refine(
 
     target_xyz: (N, 3), source_xyz: (M, 3) metres. cell: metres, of the search. Points are thinned
     to one per voxel of a third of the cell, or coarser to stay near `n_most`. settle: end on finer
-    points.
+    points. threads: with more than one the last bits differ from run to run (sums in any order).
     """
     start = np.asarray(T_target_source, dtype=np.float64)
     moved_source = apply(start, source_xyz)

@@ -1,0 +1,336 @@
+"""One answer from two maps: accepted where they meet, refused where they do not, in any frame."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, fields, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from commonmap.config import Config
+from commonmap.errors import EmptyMapError, InputError
+from commonmap.matching.decide import Figures, decide
+from commonmap.matching.match import match
+from commonmap.types import Cloud, Float64s, Leaves, Match
+from matching_scenes import apart, look, make_place, moved, rigid
+
+UTM = np.array([470_641.0, 3_810_235.0, 2_278.0])
+
+
+def pair(seed: int) -> tuple[Float64s, Float64s]:
+    """Return a drone's and a ground robot's look at one place, in one frame."""
+    place = make_place(seed)
+    target = look(place, np.random.default_rng(100 + seed))
+    source = look(
+        place, np.random.default_rng(200 + seed), roofs=False, edge=26.0, centre=(3.0, -2.0)
+    )
+    return target, source
+
+
+def best_of(answer: Match) -> Float64s:
+    """Return the pose of an answer, or of its first rival where it was refused."""
+    if answer.T_target_source is not None:
+        return answer.T_target_source
+    return answer.rivals[0].T_target_source
+
+
+@pytest.fixture(scope="module")
+def plain() -> tuple[Float64s, Float64s, Match]:
+    """Return a pair in one frame, and the answer to it."""
+    target, source = pair(0)
+    return target, source, match(target, source)
+
+
+def test_a_place_seen_twice_is_accepted(plain: tuple[Float64s, Float64s, Match]) -> None:
+    _, source, answer = plain
+    assert answer.accepted
+    assert answer.T_target_source is not None and answer.covariance is not None
+    metres, degrees = apart(answer.T_target_source, np.eye(4), source)
+    assert metres < 0.05
+    assert degrees < 0.1
+    assert answer.reason.startswith("accepted")
+    assert 0.5 < answer.confidence <= 1.0
+    assert 0.9 < answer.overlap <= 1.0
+    assert answer.score > answer.decoy_score > 0.0
+    assert np.linalg.eigvalsh(answer.covariance).min() > 0.0
+    assert answer.covariance_centre is not None
+    assert np.abs(answer.covariance_centre[:2] - [3.0, -2.0]).max() < 3.0
+    assert set(answer.timings) == {"prepare", "grid", "search", "decoy", "refine", "decide"}
+    assert all(rival.score <= answer.score for rival in answer.rivals)
+
+
+def test_the_picture_peaks_where_the_map_lies(plain: tuple[Float64s, Float64s, Match]) -> None:
+    _, _, answer = plain
+    picture = answer.picture
+    assert picture is not None and answer.T_target_source is not None
+    assert picture.score.shape == (len(picture.x), len(picture.y))
+    assert np.all(np.diff(picture.x) > 0) and np.all(np.diff(picture.y) > 0)
+    i, j = np.unravel_index(int(np.nanargmax(picture.score)), picture.score.shape)
+    at = moved(answer.T_target_source, picture.centre[None])[0]
+    step = picture.x[1] - picture.x[0]
+    assert abs(picture.x[i] - at[0]) < 1.6 * step
+    assert abs(picture.y[j] - at[1]) < 1.6 * step
+    assert len(picture.yaw) == len(picture.best_per_yaw)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_answer_follows_a_displacement_of_the_source(
+    plain: tuple[Float64s, Float64s, Match], seed: int
+) -> None:
+    target, source, answer = plain
+    rng = np.random.default_rng(seed)
+    x, y, z = rng.uniform(-300, 300, 3)
+    D = rigid(x, y, z, rng.uniform(-math.pi, math.pi))
+    again = match(target, moved(D, source))
+    assert again.accepted == answer.accepted
+    assert again.T_target_source is not None
+    metres, degrees = apart(again.T_target_source @ D, best_of(answer), source)
+    assert metres < 0.05
+    assert degrees < 0.1
+
+
+def test_a_tilted_source_is_levelled_and_matched(plain: tuple[Float64s, Float64s, Match]) -> None:
+    target, source, _ = plain
+    c, s = math.cos(math.radians(6.0)), math.sin(math.radians(6.0))
+    D = np.eye(4)
+    D[1:3, 1:3] = [[c, -s], [s, c]]
+    answer = match(target, moved(D, source))
+    assert answer.accepted
+    assert answer.T_target_source is not None and answer.T_level_source is not None
+    metres, degrees = apart(answer.T_target_source @ D, np.eye(4), source)
+    assert metres < 0.06
+    assert degrees < 0.15
+    up = answer.T_level_source[:3, :3] @ D[:3, :3] @ [0.0, 0.0, 1.0]
+    assert math.degrees(math.acos(up[2])) < 0.5
+
+
+@pytest.mark.parametrize(("one", "other"), [(0, 1), (2, 3), (4, 5)])
+def test_different_places_are_refused(one: int, other: int) -> None:
+    answer = match(pair(one)[0], pair(other)[1])
+    assert not answer.accepted
+    assert answer.T_target_source is None
+    assert answer.covariance is None and answer.covariance_centre is None
+    assert answer.reason.startswith("refused: ")
+    assert answer.confidence < 0.9
+    assert 1 <= len(answer.rivals) <= Config().search.n_rivals
+    assert answer.rivals[0].T_target_source.shape == (4, 4)
+    assert set(answer.evidence) >= set(asdict(figures_of_a_good_match()))
+
+
+def test_a_cloud_an_array_and_bad_rows_give_one_answer(
+    plain: tuple[Float64s, Float64s, Match],
+) -> None:
+    target, source, answer = plain
+    holes = source.copy()
+    holes = np.insert(holes, [0, 50, len(holes)], np.nan, axis=0)
+    holes[0] = [1.0, np.inf, 2.0]
+    again = match(Cloud(target), Cloud(holes))
+    assert again.accepted
+    assert best_of(again).tobytes() == best_of(answer).tobytes()
+    assert again.evidence == answer.evidence
+
+
+def as_leaves(xyz: Float64s, resolution: float) -> Leaves:
+    """Return the occupied smallest voxels of a cloud, keys as OctoMap counts them."""
+    keys = np.unique(np.floor(xyz / resolution).astype(np.int64) + 32768, axis=0)
+    n = len(keys)
+    return Leaves(
+        resolution, keys.astype(np.uint16), np.full(n, 16, np.uint8), np.full(n, 0.85, np.float32)
+    )
+
+
+def test_octrees_are_matched_too(plain: tuple[Float64s, Float64s, Match]) -> None:
+    target, source, _ = plain
+    answer = match(as_leaves(target, 0.1), as_leaves(source, 0.1))
+    assert answer.accepted
+    assert answer.T_target_source is not None
+    metres, degrees = apart(answer.T_target_source, np.eye(4), source)
+    assert metres < 0.08
+    assert degrees < 0.2
+
+
+def test_utm_coordinates(plain: tuple[Float64s, Float64s, Match]) -> None:
+    target, source, answer = plain
+    there = match(target + UTM, moved(rigid(0.0, 0.0, 0.0, 1.0), source))
+    assert there.accepted
+    assert there.T_target_source is not None and there.covariance_centre is not None
+    truth = np.eye(4)
+    truth[:3, 3] = UTM
+    metres, _ = apart(there.T_target_source @ rigid(0.0, 0.0, 0.0, 1.0), truth, source)
+    assert metres < 0.05
+    assert answer.covariance_centre is not None
+    assert there.covariance_centre - UTM == pytest.approx(answer.covariance_centre, abs=3.0)
+
+
+def test_the_same_input_gives_the_same_bytes(plain: tuple[Float64s, Float64s, Match]) -> None:
+    target, source, answer = plain
+    again = match(target.copy(), source.copy())
+    assert best_of(again).tobytes() == best_of(answer).tobytes()
+    assert again.evidence == answer.evidence
+    assert [r.score for r in again.rivals] == [r.score for r in answer.rivals]
+
+
+def test_the_input_is_left_as_it_was(plain: tuple[Float64s, Float64s, Match]) -> None:
+    target, source = pair(0)
+    assert np.array_equal(plain[0], target)
+    assert np.array_equal(plain[1], source)
+
+
+def test_a_metric_on_heights_goes_the_same_way(plain: tuple[Float64s, Float64s, Match]) -> None:
+    target, source, _ = plain
+    config = Config().with_values(search={"metric": "zncc", "min_overlap": 0.7})
+    answer = match(target, source, config=config)
+    assert answer.metric == "zncc"
+    metres, degrees = apart(best_of(answer), np.eye(4), source)
+    assert metres < 0.3
+    assert degrees < 1.0
+
+
+def test_an_unknown_metric_is_named() -> None:
+    config = Config().with_values(search={"metric": "nonsense"})
+    with pytest.raises(InputError, match=r"no metric named 'nonsense'; there are .*evidence"):
+        match(np.zeros((500, 3)), np.zeros((500, 3)), config=config)
+
+
+def test_decide_off_accepts_whatever_there_is() -> None:
+    config = Config().with_values(decide={"mode": "off"})
+    answer = match(pair(0)[0], pair(1)[1], config=config)
+    assert answer.accepted
+    assert answer.T_target_source is not None
+    assert "off" in answer.reason
+    assert answer.confidence < 0.9  # it does not pretend
+
+
+def test_too_little_to_match_raises() -> None:
+    rng = np.random.default_rng(1)
+    good = pair(0)[0]
+    with pytest.raises(EmptyMapError, match="source has 99 points"):
+        match(good, rng.uniform(0, 10, (99, 3)))
+    with pytest.raises(EmptyMapError, match="target has 500 points over"):
+        match(rng.uniform(0, 0.5, (500, 3)), good)
+    with pytest.raises(EmptyMapError, match="target holds no finite point"):
+        match(np.full((500, 3), np.nan), good)
+    with pytest.raises(InputError, match="shape"):
+        match(good, np.zeros((500, 2)))
+    with pytest.raises(InputError, match="spans 200 km"):
+        match(good, np.array([[0.0, 0, 0], [200_000.0, 0, 0]] * 60))
+
+
+def test_a_bare_floor_has_nothing_to_match() -> None:
+    rng = np.random.default_rng(2)
+    xy = rng.uniform(-15, 15, (20_000, 2))
+    floor = np.column_stack([xy, rng.normal(0.0, 0.02, len(xy))])
+    with pytest.raises(EmptyMapError, match="nothing stands on the ground of the source"):
+        match(pair(0)[0], floor)
+
+
+def test_progress_names_the_steps() -> None:
+    told: list[str] = []
+    match(*pair(6), progress=lambda step, share=0.0: told.append(step))
+    steps = list(dict.fromkeys(told))
+    assert steps[0] == "prepare the target"
+    assert {"search", "search the mirrored map", "refine", "decide"} <= set(steps)
+
+
+# The verdict: behaviour whatever the weights -----------------------------------------------------
+
+
+def figures_of_a_good_match() -> Figures:
+    """Return figures that any model should accept."""
+    good = {
+        "decoy_ratio": 8.0,
+        "second_ratio": 8.0,
+        "prominence": 30.0,
+        "support": 1.0,
+        "effect": 0.5,
+        "support_t": 15.0,
+        "spread": 0.7,
+        "inliers": 0.95,
+        "decoy_inliers": 0.2,
+        "overlap": 0.95,
+        "n_overlap": 5000.0,
+        "moved": 0.3,
+        "converged": 1.0,
+        "evidence": 2000.0,
+    }
+    return Figures(**good)
+
+
+def test_good_figures_are_accepted_and_chance_is_refused() -> None:
+    assert decide(figures_of_a_good_match()).accepted
+    chance = replace(
+        figures_of_a_good_match(), decoy_ratio=1.0, second_ratio=1.02, support=0.6, spread=0.0,
+        inliers=0.3, decoy_inliers=0.3, prominence=2.0, support_t=2.0, effect=0.02,
+    )  # fmt: skip
+    verdict = decide(chance)
+    assert not verdict.accepted
+    assert verdict.confidence < 0.5
+    assert not decide(Figures(*[0.0] * len(fields(Figures)))).accepted
+
+
+def figure_sets() -> st.SearchStrategy[Figures]:
+    """Draw figures over their whole ranges."""
+    share, ratio = st.floats(0.0, 1.0), st.floats(0.1, 40.0)
+    return st.builds(
+        Figures,
+        decoy_ratio=ratio,
+        second_ratio=ratio,
+        prominence=st.floats(0.0, 60.0),
+        support=share,
+        effect=share,
+        support_t=st.floats(-3.0, 30.0),
+        spread=st.floats(-2.0, 0.75),
+        inliers=share,
+        decoy_inliers=share,
+        overlap=share,
+        n_overlap=st.floats(10.0, 1e6),
+        moved=st.floats(0.0, 3.0),
+        converged=st.just(1.0),
+        evidence=st.floats(0.0, 1e5),
+    )
+
+
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(
+    figure_sets(),
+    st.sampled_from(["decoy_ratio", "second_ratio", "support", "inliers", "spread"]),
+    st.floats(0.0, 1.0),
+)
+def test_more_for_the_pose_never_lowers_the_confidence(
+    figures: Figures, name: str, more: float
+) -> None:
+    value = getattr(figures, name)
+    top = {"decoy_ratio": 40.0, "second_ratio": 40.0, "spread": 0.75}.get(name, 1.0)
+    better = replace(figures, **{name: value + more * (top - value)})
+    before, after = decide(figures), decide(better)
+    assert after.confidence >= before.confidence - 1e-12
+    assert after.accepted or not before.accepted
+
+
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(figure_sets(), st.sampled_from([0.0, 1.0]))
+def test_every_verdict_has_one_sentence_that_fits_it(figures: Figures, converged: float) -> None:
+    verdict = decide(replace(figures, converged=converged))
+    assert 0.0 <= verdict.confidence <= 1.0
+    assert verdict.reason.startswith("accepted: " if verdict.accepted else "refused: ")
+    assert "\n" not in verdict.reason
+    assert ". " not in verdict.reason
+    assert not verdict.reason.endswith(".")
+    assert 20 < len(verdict.reason) < 250
+    if not converged:
+        assert not verdict.accepted
+
+
+def test_a_pose_that_the_refinement_left_is_refused_however_good() -> None:
+    verdict = decide(replace(figures_of_a_good_match(), converged=0.0))
+    assert not verdict.accepted
+    assert verdict.confidence <= 0.5
+    assert "refinement" in verdict.reason
+
+
+@pytest.mark.parametrize("name", ["decoy_ratio", "second_ratio"])
+def test_no_better_than_chance_is_refused_however_good(name: str) -> None:
+    assert not decide(replace(figures_of_a_good_match(), **{name: 1.0})).accepted
