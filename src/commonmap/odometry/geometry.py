@@ -1,0 +1,126 @@
+"""Rings and times of points from the geometry of a turn, for logs that hold neither."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from commonmap.types import Float32s, Float64s, Scan
+
+PERIOD = 0.1
+"""Seconds a turn, where there is a single scan and nothing tells."""
+BINS = 4096
+
+
+def complete_scans(scans: Iterable[Scan], notes: list[str]) -> Iterator[Scan]:
+    """Yield the scans; those without rings or times get them, which is told once in `notes`."""
+    period = PERIOD
+    waiting: Scan | None = None
+    for scan in scans:
+        if waiting is not None:
+            period = min(scan.stamp - waiting.stamp, 10 * PERIOD)
+            yield complete_scan(waiting, period, notes)
+        waiting = scan
+    if waiting is not None:
+        yield complete_scan(waiting, period, notes)
+
+
+def complete_scan(scan: Scan, period: float, notes: list[str]) -> Scan:
+    """Return the scan with rings from elevation and times from azimuth where it has none.
+
+    A scan has no rings or times where all its points have the same. period: seconds a turn.
+    """
+    if len(scan.xyz) < 2:
+        return scan
+    ring, time = scan.ring, scan.time
+    if int(ring.max()) == int(ring.min()):
+        ring, wraps = derive_rings(scan.xyz)
+        how = "the order of the points" if wraps else "their elevation"
+        note = f"the log has no ring numbers: {int(ring.max()) + 1} rings were derived from {how}"
+        _tell(notes, note, "the log has no ring")
+    if float(time.max()) == float(time.min()):
+        time = derive_times(scan.xyz, ring, scan.stamp, period)
+        note = "the log has no time per point: times were derived from the azimuth of the points"
+        _tell(notes, note, "the log has no time")
+    if ring is scan.ring and time is scan.time:
+        return scan
+    return Scan(scan.xyz, time, ring, scan.intensity, scan.stamp)
+
+
+def _tell(notes: list[str], note: str, kind: str) -> None:
+    if not any(old.startswith(kind) for old in notes):
+        notes.append(note)
+
+
+def derive_rings(xyz: Float32s) -> tuple[NDArray[np.uint16], bool]:
+    """Return the ring of each point (N,), lowest first, and whether the order of points told it.
+
+    Where the points come ring after ring, the azimuth jumps back once a ring; else the elevations
+    are cut at the gaps of their histogram.
+    """
+    azimuth = np.arctan2(xyz[:, 1], xyz[:, 0]).astype(np.float64)
+    elevation = np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1])).astype(np.float64)
+    by_order = _rings_by_order(azimuth, elevation)
+    if by_order is not None:
+        return by_order, True
+    return _rings_by_elevation(elevation), False
+
+
+def _rings_by_order(azimuth: Float64s, elevation: Float64s) -> NDArray[np.uint16] | None:
+    """Return rings where points come ring after ring, else None."""
+    step = np.diff(azimuth)
+    step = (step + np.pi) % (2 * np.pi) - np.pi
+    if np.mean(np.abs(step) < np.radians(3.0)) < 0.95:
+        return None
+    sense = 1.0 if np.median(step) >= 0 else -1.0
+    # angle gone round since the first point; a ring ends where a full turn is complete
+    start = azimuth[0] if len(azimuth) else 0.0
+    along = (sense * (azimuth - start)) % (2 * np.pi)
+    ends = np.flatnonzero(np.diff(along) < -np.pi) + 1
+    ring = np.zeros(len(azimuth), np.int64)
+    ring[ends] = 1
+    ring = np.cumsum(ring)
+    n = int(ring.max()) + 1
+    if not 4 <= n <= 256:
+        return None
+    middle = np.array([np.median(elevation[ring == k]) for k in range(n)])
+    spread = np.array([np.median(np.abs(elevation[ring == k] - middle[k])) for k in range(n)])
+    if np.median(spread) > 0.5 * np.median(np.abs(np.diff(middle))):
+        return None
+    rank = np.empty(n, np.int64)
+    rank[np.argsort(middle, kind="stable")] = np.arange(n)
+    return rank[ring].astype(np.uint16)
+
+
+def _rings_by_elevation(elevation: Float64s) -> NDArray[np.uint16]:
+    """Return rings by clusters of elevation."""
+    low, high = np.quantile(elevation, [0.001, 0.999])
+    edges = np.linspace(low, high, BINS + 1)
+    count, _ = np.histogram(elevation, edges)
+    wide = np.convolve(count, np.ones(5) / 5, mode="same")
+    full = wide > 0.15 * np.median(np.sort(wide)[-BINS // 4 :])
+    starts = np.flatnonzero(full & ~np.concatenate([[False], full[:-1]]))
+    stops = np.flatnonzero(full & ~np.concatenate([full[1:], [False]])) + 1
+    middle = (edges[starts] + edges[stops]) / 2
+    if not 4 <= len(middle) <= 256:  # no clusters: equal slices, as many as a common sensor has
+        return np.clip((elevation - low) / max(high - low, 1e-9) * 64, 0, 63).astype(np.uint16)
+    between = (middle[1:] + middle[:-1]) / 2
+    ring: NDArray[np.uint16] = np.searchsorted(between, elevation).astype(np.uint16)
+    return ring
+
+
+def derive_times(xyz: Float32s, ring: NDArray[np.uint16], stamp: float, period: float) -> Float64s:
+    """Return the time of each point (N,) from its azimuth, for a head that turns evenly.
+
+    The turn begins behind the sensor (at -x) unless the points' own order begins elsewhere, and
+    goes clockwise seen from above unless the order of points on the rings says otherwise.
+    """
+    azimuth = np.arctan2(xyz[:, 1], xyz[:, 0]).astype(np.float64)
+    same = np.diff(ring.astype(np.int64)) == 0
+    step = np.diff(azimuth)
+    step = ((step + np.pi) % (2 * np.pi) - np.pi)[same]
+    sense = 1.0 if len(step) and np.median(step) > 0 else -1.0
+    along = (sense * (azimuth - azimuth[0])) % (2 * np.pi)
+    return np.asarray(stamp + period * along / (2 * np.pi))

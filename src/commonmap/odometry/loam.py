@@ -1,0 +1,289 @@
+"""LOAM: lidar odometry and mapping in one pass over the turns.
+
+J. Zhang and S. Singh, "LOAM: Lidar Odometry and Mapping in Real-time", RSS 2014, as the source
+paper uses it; degeneracy after Zhang, Kaess and Singh, ICRA 2016. What is done otherwise, and why,
+stands in docs/odometry.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from commonmap.frames import invert
+from commonmap.odometry.features import Features, pick_features
+from commonmap.odometry.local_map import LocalMap, thin
+from commonmap.odometry.map_match import match_lines, match_planes
+from commonmap.odometry.motion import T_to_motion, damp_rate, deskew, motion_to_T, sweep_motion
+from commonmap.odometry.records import ScanHealth
+from commonmap.odometry.scan_match import (
+    RingedPoints,
+    by_ring,
+    match_scan_lines,
+    match_scan_planes,
+)
+from commonmap.odometry.solve import Openness, Rows, bisquare, find_openness, minimise, residuals
+from commonmap.odometry.turn import Turn, arrange
+from commonmap.types import Float64s, Scan
+
+STILL = np.zeros(6)
+
+
+@dataclass(frozen=True)
+class LoamOptions:
+    """Settings of `Loam`. Lengths that are None follow from the first turn.
+
+    voxel: metres, edge of the fine map's voxels; the median range / 30 (0.1 to 1 m) unless given.
+    coarse: the coarse map's voxels, in fine ones.
+    n_planar: planar points a turn to register to the map, about.
+    scan_rounds, map_rounds: how often partners are looked for, at most.
+    tolerance: metres; a direction whose pose would be less certain is degenerate.
+    deskew: whether the points were measured while the sensor moved.
+    """
+
+    voxel: float | None = None
+    coarse: float = 3.0
+    per_voxel: int = 20
+    n_planar: int = 1500
+    scan_rounds: int = 3
+    map_rounds: int = 4
+    tolerance: float = 0.1
+    deskew: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Taken:
+    """A turn with what was chosen from it, points as measured (not deskewed), (N, 3) float64."""
+
+    turn: Turn
+    sharp: Float64s
+    sharp_delay: Float64s
+    sharp_ring: NDArray[np.int64]
+    flat: Float64s
+    flat_delay: Float64s
+    flat_ring: NDArray[np.int64]
+    edge: Float64s
+    edge_delay: Float64s
+    edge_ring: NDArray[np.int64]
+    smooth: Float64s
+    smooth_delay: Float64s
+    smooth_ring: NDArray[np.int64]
+
+
+class Loam:
+    """The state of the odometry. Feed turns in order of time with `add`, end with `finish`.
+
+    poses, moments, health: one a turn so far. The last pose may still change with the next turn.
+    """
+
+    def __init__(self, options: LoamOptions | None = None):
+        self.options = options or LoamOptions()
+        self.poses: list[Float64s] = []
+        self.moments: list[float] = []
+        self.health: list[ScanHealth] = []
+        self._last: Taken | None = None
+        self._rate: Float64s = STILL  # motion per second of the last turn, its own frame
+        self._deskew_rate_last: Float64s = STILL
+        self._cell = 0.0
+        self._cropped: Float64s = np.zeros(3)
+
+    # ------------------------------------------------------------ one turn
+
+    def add(self, scan: Scan) -> None:
+        """Take in the next turn."""
+        turn = arrange(scan)
+        if not self.poses:
+            self._begin(turn)
+            return
+        taken = self._take(turn)
+        dt = turn.moment - self.moments[-1]
+        # scan to scan: the prior
+        T_last_turn = self._match_last(taken, dt)
+        # scan to map: the pose
+        T_map_turn, health = self._match_map(taken, self.poses[-1] @ T_last_turn, dt)
+        self.poses.append(T_map_turn)
+        self.moments.append(turn.moment)
+        self.health.append(health)
+        # the turn before lies between two known poses now: deskew it for good and keep it
+        self._keep_last()
+        self._rate = self._motion_of(T_map_turn, dt)
+        self._last = taken
+
+    def finish(self) -> None:
+        """Take the last turn into the map."""
+        if self._last is not None:
+            self._keep_last()
+
+    def _begin(self, turn: Turn) -> None:
+        """Derive the lengths from the first turn and make the maps."""
+        o = self.options
+        median = float(np.median(turn.range)) if len(turn.range) else 10.0
+        self.voxel = float(np.clip(median / 30.0, 0.1, 1.0)) if o.voxel is None else o.voxel
+        self.lever = median
+        reach = float(np.clip(1.2 * turn.range.max(initial=10.0), 10.0, 250.0))
+        self.fine = LocalMap(self.voxel, per_voxel=o.per_voxel, reach=reach)
+        self.coarse = LocalMap(o.coarse * self.voxel, per_voxel=o.per_voxel, reach=reach)
+        self.edges = LocalMap(2.0 * self.voxel, per_voxel=o.per_voxel, reach=reach)
+        self._cell = 2.0 * self.voxel
+        self.poses.append(np.eye(4))
+        self.moments.append(turn.moment)
+        self.health.append(ScanHealth(turn.moment, 0, 0.0, float("nan"), np.zeros((0, 6)), False))
+        self._last = self._take(turn)
+
+    def _take(self, turn: Turn) -> Taken:
+        """Pick the features of a turn."""
+        features: Features = pick_features(turn)
+        ring = np.repeat(np.arange(turn.n_rings), np.diff(turn.ring_start))
+        xyz = turn.xyz
+        smooth = features.smooth
+        smooth = smooth[thin(xyz[smooth].astype(np.float64), self.fine.apart)]
+        parts: list[NDArray[np.float64] | NDArray[np.int64]] = []
+        for chosen in (features.sharp, features.flat, features.less_sharp, smooth):
+            parts += [xyz[chosen].astype(np.float64), turn.delay[chosen], ring[chosen]]
+        return Taken(turn, *parts)  # type: ignore[arg-type]
+
+    def _motion_of(self, T_map_turn: Float64s, dt: float) -> Float64s:
+        """Return the motion per second (6,) that led from the last pose to this one."""
+        T_turn_last = invert(T_map_turn) @ self.poses[-2 if len(self.poses) > 1 else -1]
+        rate, _ = sweep_motion(T_to_motion(T_turn_last), dt)
+        return rate
+
+    def _unskew(
+        self, points: Float64s, delay: Float64s, rate: Float64s, bend: Float64s
+    ) -> Float64s:
+        return deskew(points, delay, rate, bend) if self.options.deskew else points
+
+    # ------------------------------------------------------------ scan to scan
+
+    def _match_last(self, taken: Taken, dt: float) -> Float64s:
+        """Return T_last_turn from the features of this turn and the last (section V of LOAM)."""
+        assert self._last is not None
+        first = len(self.poses) == 1
+        rate = self._rate
+        rounds = 8 if first else self.options.scan_rounds
+        T = motion_to_T(rate * dt)
+        before: tuple[RingedPoints, RingedPoints] | None = None
+        for _ in range(rounds):
+            # the first two turns are deskewed together, by the motion between them
+            if before is None or first:
+                before = self._ringed(self._last, rate if first else self._deskew_rate_last)
+            sharp = self._unskew(taken.sharp, taken.sharp_delay, rate, STILL)
+            flat = self._unskew(taken.flat, taken.flat_delay, rate, STILL)
+            reach = max(3.0 * self.voxel, 1.0 if first else 0.5)
+            rows = join(
+                match_scan_lines(sharp, taken.sharp_ring, T, before[0], reach),
+                match_scan_planes(flat, taken.flat_ring, T, before[1], reach),
+            )
+            if len(rows) < 20:
+                break
+            T_new, _, _ = self._solve(T, rows, iterations=3)
+            step = T_to_motion(invert(T) @ T_new)
+            T = T_new
+            new_rate, _ = sweep_motion(T_to_motion(invert(T)), dt)
+            rate = damp_rate(new_rate, None if first else self._rate)
+            if np.abs(step[:3]).max() < 2e-3 and np.abs(step[3:]).max() < 2e-4:
+                break
+        if first:
+            self._rate = rate
+            self._deskew_rate_last = rate
+            self._insert(self._last, self.poses[0], rate, STILL)
+        return T
+
+    def _ringed(self, last: Taken, rate: Float64s) -> tuple[RingedPoints, RingedPoints]:
+        """Return the last turn's edges and planar points, deskewed, ready for look-up."""
+        n = last.turn.n_rings
+        edge = self._unskew(last.edge, last.edge_delay, rate, STILL)
+        some = slice(None, None, max(1, len(last.smooth) // 6000))
+        smooth = self._unskew(last.smooth[some], last.smooth_delay[some], rate, STILL)
+        return by_ring(edge, last.edge_ring, n), by_ring(smooth, last.smooth_ring[some], n)
+
+    # ------------------------------------------------------------ scan to map
+
+    def _match_map(self, taken: Taken, T: Float64s, dt: float) -> tuple[Float64s, ScanHealth]:
+        """Return T_map_turn and how well it is known (section VI of LOAM)."""
+        o = self.options
+        chosen = thin(taken.smooth, self._cell)
+        growth = np.sqrt(max(len(chosen), 1) / o.n_planar)
+        self._cell = float(np.clip(self._cell * growth, 0.5 * self.voxel, 6.0 * self.voxel))
+        points, delay = taken.smooth[chosen], taken.smooth_delay[chosen]
+        T_guess = T
+        rows, w = join(), np.zeros(0)
+        open_: Openness | None = None
+        looked = len(points) + len(taken.edge)
+        for _ in range(o.map_rounds):
+            rate, _ = sweep_motion(T_to_motion(invert(T) @ self.poses[-1]), dt)
+            planar = self._unskew(points, delay, rate, STILL)
+            edge = self._unskew(taken.edge, taken.edge_delay, rate, STILL)
+            lines = match_lines(edge, T, self.edges)
+            rows = join(match_planes(planar, T, self.fine, self.coarse), lines)
+            if len(rows) < 30:
+                break
+            T_new, open_, w = self._solve(T, rows, iterations=2)
+            step = T_to_motion(invert(T) @ T_new)
+            T = T_new
+            if np.abs(step[:3]).max() < 2e-3 and np.abs(step[3:]).max() < 2e-4:
+                break
+        self._deskew_rate_last = sweep_motion(T_to_motion(invert(T) @ self.poses[-1]), dt)[0]
+        n_matched = int((w > 0).sum())
+        share = n_matched / max(looked, 1)
+        lost = n_matched < 30 or share < 0.1
+        R = T[:3, :3]
+        degenerate = np.zeros((0, 6)) if open_ is None else open_.directions
+        degenerate = np.hstack([degenerate[:, :3] @ R.T, degenerate[:, 3:] @ R.T])
+        residual = float("nan")
+        if len(rows):
+            d = residuals(np.ascontiguousarray(R), T[:3, 3].copy(), rows.p, rows.c, rows.u)
+            residual = 1.4826 * float(np.median(np.abs(d)))
+        health = ScanHealth(taken.turn.moment, n_matched, share, residual, degenerate, lost)
+        return (T_guess if lost else T), health
+
+    def _solve(
+        self, T: Float64s, rows: Rows, *, iterations: int
+    ) -> tuple[Float64s, Openness, Float64s]:
+        """Return the pose after a few steps of Levenberg-Marquardt with robust weights."""
+        R, t = np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy()
+        robust, spread = bisquare(residuals(R, t, rows.p, rows.c, rows.u) / rows.sigma)
+        w = robust / (spread * rows.sigma) ** 2
+        open_ = find_openness(R, rows, w, lever=self.lever, tolerance=self.options.tolerance)
+        return minimise(T, rows, w, open_, iterations=iterations), open_, w
+
+    # ------------------------------------------------------------ the map
+
+    def _keep_last(self) -> None:
+        """Deskew the turn before the last pose for good and insert it into the map."""
+        if len(self.poses) < 3:
+            return
+        assert self._last is not None
+        T, dt0 = self.poses[-2], self.moments[-2] - self.moments[-3]
+        before = T_to_motion(invert(T) @ self.poses[-3])
+        after, dt1 = T_to_motion(invert(T) @ self.poses[-1]), self.moments[-1] - self.moments[-2]
+        rate, bend = sweep_motion(before, dt0, after, dt1)
+        self._insert(self._last, T, rate, bend)
+
+    def _insert(self, taken: Taken, T: Float64s, rate: Float64s, bend: Float64s) -> None:
+        R, t = T[:3, :3].T, T[:3, 3]
+        smooth = self._unskew(taken.smooth, taken.smooth_delay, rate, bend) @ R + t
+        edge = self._unskew(taken.edge, taken.edge_delay, rate, bend) @ R + t
+        self.fine.insert(smooth)
+        self.coarse.insert(smooth)
+        self.edges.insert(edge)
+        if float(np.linalg.norm(t - self._cropped)) > 0.1 * self.fine.reach:
+            for part in (self.fine, self.coarse, self.edges):
+                part.crop(np.ascontiguousarray(t))
+            self._cropped = t.copy()
+
+
+def join(*parts: Rows) -> Rows:
+    """Return the rows of all parts, one after the other."""
+    if not parts:
+        none = np.zeros((0, 3))
+        return Rows(none, none, none, np.zeros(0), np.zeros(0))
+    return Rows(
+        np.concatenate([part.p for part in parts]),
+        np.concatenate([part.c for part in parts]),
+        np.concatenate([part.u for part in parts]),
+        np.concatenate([part.sigma for part in parts]),
+        np.concatenate([part.tilt for part in parts]),
+    )

@@ -1,0 +1,164 @@
+"""The ways to a trajectory, one table. `estimate` runs a row of it over a stream of scans."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from importlib.util import find_spec
+
+import numpy as np
+
+from commonmap.errors import InputError, MissingExtraError
+from commonmap.frames import check_T
+from commonmap.odometry.geometry import complete_scans
+from commonmap.odometry.kiss import estimate_kiss_icp
+from commonmap.odometry.loam import Loam, LoamOptions
+from commonmap.odometry.records import Odometry, ScanHealth
+from commonmap.types import Progress, Scan, Trajectory, no_progress
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class OdometryMethod:
+    """A row of the table.
+
+    run: takes scans (ring and time per point), the options and the progress; gives the answer.
+    extra: the optional package it needs, empty for none. needs_poses: poses must be given.
+    """
+
+    run: Callable[[Iterable[Scan], LoamOptions, Progress], Odometry] | None
+    summary: str
+    extra: str = ""
+    needs_poses: bool = False
+
+    def available(self) -> str:
+        """Return why the row cannot be used, empty where it can."""
+        if self.extra and find_spec(self.extra.replace("-", "_")) is None:
+            return f"it needs the package {self.extra} (pip install {self.extra})"
+        return ""
+
+
+def estimate(
+    scans: Iterable[Scan],
+    *,
+    method: str = "loam",
+    poses: Trajectory | None = None,
+    options: LoamOptions | None = None,
+    progress: Progress = no_progress,
+) -> Odometry:
+    """Return where the sensor was at each turn, from the turns alone.
+
+    scans: in order of time, read once, one at a time. Turns without rings or times (all the same)
+        get them from the geometry, with a note.
+    method: a row of `ODOMETRY`. poses: for method "poses", the trajectory that is known.
+    options: of LOAM.
+    """
+    if method not in ODOMETRY:
+        raise InputError(f"odometry must be one of {', '.join(ODOMETRY)}; '{method}' came")
+    row = ODOMETRY[method]
+    missing = row.available()
+    if missing:
+        raise MissingExtraError(f"odometry '{method}' cannot run: {missing}")
+    if row.needs_poses != (poses is not None):
+        need = "needs" if row.needs_poses else "does not take"
+        raise InputError(f"odometry '{method}' {need} known poses")
+    if poses is not None:
+        return take_poses(check_order(scans), poses, progress)
+    assert row.run is not None
+    notes: list[str] = []
+    completed = complete_scans(check_order(scans), notes)
+    answer = row.run(completed, options or LoamOptions(), progress)
+    for note in notes:
+        log.warning("%s", note)
+    return Odometry(answer.method, answer.trajectory, answer.health, (*notes, *answer.notes))
+
+
+def check_order(scans: Iterable[Scan]) -> Iterator[Scan]:
+    """Yield the scans; raise where arrays are of unequal length, times are not finite or fall."""
+    last, number = -np.inf, -1
+    for number, scan in enumerate(scans):
+        n = len(scan.xyz)
+        if scan.xyz.shape != (n, 3) or scan.time.shape != (n,) or scan.ring.shape != (n,):
+            raise InputError(
+                f"scan {number} must have (N, 3) points, (N,) times and (N,) rings; shapes "
+                f"{scan.xyz.shape}, {scan.time.shape} and {scan.ring.shape} came"
+            )
+        if not (np.isfinite(scan.stamp) and np.isfinite(scan.time).all()):
+            raise InputError(f"scan {number} must have finite times; NaN or infinity came")
+        if scan.stamp <= last:
+            raise InputError(
+                f"scans must come in order of time; scan {number} is of {scan.stamp:.6f} s, "
+                f"the one before of {last:.6f} s"
+            )
+        last = scan.stamp
+        yield scan
+    if number < 0:
+        raise InputError("odometry needs at least one scan; none came")
+
+
+def estimate_loam(scans: Iterable[Scan], options: LoamOptions, progress: Progress) -> Odometry:
+    """Return the trajectory by LOAM."""
+    loam = Loam(options)
+    progress("odometry")
+    for number, scan in enumerate(scans):
+        loam.add(scan)
+        if number % 50 == 49:
+            progress(f"odometry, {number + 1} turns")
+    loam.finish()
+    trajectory = Trajectory(np.array(loam.moments), np.array(loam.poses))
+    return Odometry("loam", trajectory, tuple(loam.health), describe_health(loam.health))
+
+
+def describe_health(health: list[ScanHealth]) -> tuple[str, ...]:
+    """Return one sentence for each stretch of turns in trouble."""
+    notes: list[str] = []
+    start = 0
+    kinds = ["lost" if h.lost else "open" if len(h.degenerate) else "" for h in health]
+    for k in range(1, len(kinds) + 1):
+        if k < len(kinds) and kinds[k] == kinds[start]:
+            continue
+        if kinds[start]:
+            stretch = f"from {health[start].moment:.2f} to {health[k - 1].moment:.2f} s"
+            if kinds[start] == "lost":
+                notes.append(f"odometry is lost {stretch} ({k - start} turns)")
+            else:
+                middle = health[(start + k) // 2] if k - start > 1 else health[start]
+                told = middle.tell().split(" s ", 1)[1]
+                notes.append(f"{stretch} ({k - start} turns) {told}")
+        start = k
+    return tuple(notes)
+
+
+def take_poses(scans: Iterable[Scan], poses: Trajectory, progress: Progress) -> Odometry:
+    """Return the known poses as an answer; the scans must lie within their time."""
+    T = np.array([check_T(T, "a pose") for T in poses.T_map_sensor])
+    if len(poses.time) < 2 or len(T) != len(poses.time) or (np.diff(poses.time) <= 0).any():
+        raise InputError("known poses must be at least two, with rising times")
+    progress("odometry")
+    first = last = None
+    for scan in scans:
+        first = scan.stamp if first is None else first
+        last = scan.stamp
+    assert first is not None and last is not None
+    step = float(np.median(np.diff(poses.time)))
+    if first < poses.time[0] - step or last > poses.time[-1] + step:
+        raise InputError(
+            f"known poses must cover the scans ({first:.3f} to {last:.3f} s); they are of "
+            f"{poses.time[0]:.3f} to {poses.time[-1]:.3f} s"
+        )
+    return Odometry("poses", Trajectory(np.asarray(poses.time, np.float64), T), ())
+
+
+def _run_kiss_icp(scans: Iterable[Scan], options: LoamOptions, progress: Progress) -> Odometry:
+    return estimate_kiss_icp(scans, voxel=None, deskew=options.deskew, progress=progress)
+
+
+ODOMETRY: dict[str, OdometryMethod] = {
+    "loam": OdometryMethod(estimate_loam, "LOAM (Zhang and Singh 2014): edges and planes"),
+    "poses": OdometryMethod(None, "poses that are known", needs_poses=True),
+    "kiss-icp": OdometryMethod(
+        _run_kiss_icp, "KISS-ICP (Vizzo et al. 2023), for comparison", extra="kiss-icp"
+    ),
+}
