@@ -68,9 +68,12 @@ def test_separated_error_holds(
     at = np.clip((g - separated.middle) / separated.half, -1, 1) if half else 0.0 * g
     u, waves = separated.source @ separated.waves(x), separated.waves(y)
     value = np.zeros(x.size)
+    T = np.cos(np.multiply.outer(np.arange(separated.mix.shape[0]), np.arccos(at)))
+    f = separated.mix.T @ T
+    np.testing.assert_allclose(f[:, 0], separated.functions(g[0]), atol=1e-12)
     for m, some in enumerate(separated.pairs):
         for p in some:
-            value += np.cos(m * np.arccos(at)) * u[p] * (separated.target[m, p] @ waves)
+            value += f[m] * u[p] * (separated.target[m, p] @ waves)
     s = y - x + g
     seen = np.max(np.abs(value - PSI[name].evaluate(s) - linear * s))
     assert seen <= separated.error <= 1.1e-6
