@@ -34,6 +34,7 @@ SIGNATURES: tuple[tuple[bytes, str], ...] = (
     (b"\xd4\xc3\xb2\xa1", "pcap"),
     (b"\xa1\xb2\xc3\xd4", "pcap"),
     (b"\x4d\x3c\xb2\xa1", "pcap"),
+    (b"\xa1\xb2\x3c\x4d", "pcap"),
     (b"\x0a\x0d\x0d\x0a", "pcapng"),
     (b"\x1f\x8b", "gzip"),
     (b"7z\xbc\xaf", "7-Zip"),
