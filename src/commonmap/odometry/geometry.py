@@ -75,23 +75,23 @@ def _rings_by_order(azimuth: Float64s, elevation: Float64s) -> NDArray[np.uint16
     if np.mean(np.abs(step) < np.radians(3.0)) < 0.95:
         return None
     sense = 1.0 if np.median(step) >= 0 else -1.0
-    # angle gone round since the first point; a ring ends where a full turn is complete
-    start = azimuth[0] if len(azimuth) else 0.0
-    along = (sense * (azimuth - start)) % (2 * np.pi)
-    ends = np.flatnonzero(np.diff(along) < -np.pi) + 1
-    ring = np.zeros(len(azimuth), np.int64)
-    ring[ends] = 1
-    ring = np.cumsum(ring)
-    n = int(ring.max()) + 1
-    if not 4 <= n <= 256:
-        return None
-    middle = np.array([np.median(elevation[ring == k]) for k in range(n)])
-    spread = np.array([np.median(np.abs(elevation[ring == k] - middle[k])) for k in range(n)])
-    if np.median(spread) > 0.5 * np.median(np.abs(np.diff(middle))):
-        return None
-    rank = np.empty(n, np.int64)
-    rank[np.argsort(middle, kind="stable")] = np.arange(n)
-    return rank[ring].astype(np.uint16)
+    # the angle gone round falls back where a ring ends; where a ring begins is not known
+    for start in (azimuth[0], 0.0, np.pi):
+        along = (sense * (azimuth - start)) % (2 * np.pi)
+        ring = np.zeros(len(azimuth), np.int64)
+        ring[1:] = np.cumsum(np.diff(along) < -np.pi)
+        n = int(ring[-1]) + 1
+        if not 4 <= n <= 256:
+            continue
+        middle = np.array([np.median(elevation[ring == k]) for k in range(n)])
+        fall = np.diff(middle)
+        if max(np.mean(fall > 0), np.mean(fall < 0)) < 0.95:
+            continue
+        rank = np.empty(n, np.int64)
+        rank[np.argsort(middle, kind="stable")] = np.arange(n)
+        numbered: NDArray[np.uint16] = rank[ring].astype(np.uint16)
+        return numbered
+    return None
 
 
 def _rings_by_elevation(elevation: Float64s) -> NDArray[np.uint16]:
@@ -107,8 +107,8 @@ def _rings_by_elevation(elevation: Float64s) -> NDArray[np.uint16]:
     if not 4 <= len(middle) <= 256:  # no clusters: equal slices, as many as a common sensor has
         return np.clip((elevation - low) / max(high - low, 1e-9) * 64, 0, 63).astype(np.uint16)
     between = (middle[1:] + middle[:-1]) / 2
-    ring: NDArray[np.uint16] = np.searchsorted(between, elevation).astype(np.uint16)
-    return ring
+    ring: NDArray[np.int64] = np.searchsorted(between, elevation)
+    return np.array(ring, dtype=np.uint16)
 
 
 def derive_times(xyz: Float32s, ring: NDArray[np.uint16], stamp: float, period: float) -> Float64s:

@@ -35,7 +35,7 @@ STILL = np.zeros(6)
 class LoamOptions:
     """Settings of `Loam`. Lengths that are None follow from the first turn.
 
-    voxel: metres, edge of the fine map's voxels; the median range / 30 (0.1 to 1 m) unless given.
+    voxel: metres, edge of the fine map's voxels; the median range / 45 (0.2 to 1 m) unless given.
     coarse: the coarse map's voxels, in fine ones.
     n_planar: planar points a turn to register to the map, about.
     scan_rounds, map_rounds: how often partners are looked for, at most.
@@ -47,7 +47,7 @@ class LoamOptions:
     coarse: float = 3.0
     per_voxel: int = 20
     n_planar: int = 1500
-    scan_rounds: int = 3
+    scan_rounds: int = 2
     map_rounds: int = 4
     tolerance: float = 0.1
     deskew: bool = True
@@ -120,7 +120,7 @@ class Loam:
         """Derive the lengths from the first turn and make the maps."""
         o = self.options
         median = float(np.median(turn.range)) if len(turn.range) else 10.0
-        self.voxel = float(np.clip(median / 30.0, 0.1, 1.0)) if o.voxel is None else o.voxel
+        self.voxel = float(np.clip(median / 45.0, 0.2, 1.0)) if o.voxel is None else o.voxel
         self.lever = median
         reach = float(np.clip(1.2 * turn.range.max(initial=10.0), 10.0, 250.0))
         self.fine = LocalMap(self.voxel, per_voxel=o.per_voxel, reach=reach)
@@ -179,11 +179,11 @@ class Loam:
             if len(rows) < 20:
                 break
             T_new, _, _ = self._solve(T, rows, iterations=3)
-            step = T_to_motion(invert(T) @ T_new)
+            step = self._moved(T, T_new)
             T = T_new
             new_rate, _ = sweep_motion(T_to_motion(invert(T)), dt)
             rate = damp_rate(new_rate, None if first else self._rate)
-            if np.abs(step[:3]).max() < 2e-3 and np.abs(step[3:]).max() < 2e-4:
+            if step < 0.05 * self.voxel:
                 break
         if first:
             self._rate = rate
@@ -212,18 +212,23 @@ class Loam:
         rows, w = join(), np.zeros(0)
         open_: Openness | None = None
         looked = len(points) + len(taken.edge)
+        planes = lines = rows
+        asked: Float64s | None = None  # the pose at which the map was asked for partners
         for _ in range(o.map_rounds):
             rate, _ = sweep_motion(T_to_motion(invert(T) @ self.poses[-1]), dt)
             planar = self._unskew(points, delay, rate, STILL)
             edge = self._unskew(taken.edge, taken.edge_delay, rate, STILL)
-            lines = match_lines(edge, T, self.edges)
-            rows = join(match_planes(planar, T, self.fine, self.coarse), lines)
+            if asked is None or self._moved(asked, T) > 0.2 * self.voxel:
+                planes = match_planes(planar, T, self.fine, self.coarse)
+                lines = match_lines(edge, T, self.edges)
+                asked = T
+            rows = join(planes.refresh(planar), lines.refresh(edge))
             if len(rows) < 30:
                 break
             T_new, open_, w = self._solve(T, rows, iterations=2)
-            step = T_to_motion(invert(T) @ T_new)
+            step = self._moved(T, T_new)
             T = T_new
-            if np.abs(step[:3]).max() < 2e-3 and np.abs(step[3:]).max() < 2e-4:
+            if step < 0.01 * self.voxel:
                 break
         self._deskew_rate_last = sweep_motion(T_to_motion(invert(T) @ self.poses[-1]), dt)[0]
         n_matched = int((w > 0).sum())
@@ -238,6 +243,11 @@ class Loam:
             residual = 1.4826 * float(np.median(np.abs(d)))
         health = ScanHealth(taken.turn.moment, n_matched, share, residual, degenerate, lost)
         return (T_guess if lost else T), health
+
+    def _moved(self, T: Float64s, T_new: Float64s) -> float:
+        """Return how far the scene moves between two poses, metres: shift and turn together."""
+        step = T_to_motion(invert(T) @ T_new)
+        return float(np.linalg.norm(step[:3]) + self.lever * np.linalg.norm(step[3:]))
 
     def _solve(
         self, T: Float64s, rows: Rows, *, iterations: int
@@ -279,11 +289,12 @@ def join(*parts: Rows) -> Rows:
     """Return the rows of all parts, one after the other."""
     if not parts:
         none = np.zeros((0, 3))
-        return Rows(none, none, none, np.zeros(0), np.zeros(0))
+        return Rows(none, none, none, np.zeros(0), np.zeros(0), np.zeros(0, np.int64))
     return Rows(
         np.concatenate([part.p for part in parts]),
         np.concatenate([part.c for part in parts]),
         np.concatenate([part.u for part in parts]),
         np.concatenate([part.sigma for part in parts]),
         np.concatenate([part.tilt for part in parts]),
+        np.concatenate([part.feature for part in parts]),
     )

@@ -87,10 +87,10 @@ def _gather(x, y, z, edge, keys, count, kept, table, mean, S):  # type: ignore[n
 def _planes(  # type: ignore[no-untyped-def]
     points, R, t, edge, keys, count, kept, table, edge2, keys2, count2, kept2, table2
 ):
-    """Return p, c, u, sigma, tilt of the rows of planar points."""
+    """Return p, c, u, sigma, tilt, feature of the rows of planar points."""
     n = points.shape[0]
     p, c, u = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
-    sigma, tilt = np.empty(n), np.empty(n)
+    sigma, tilt, feature = np.empty(n), np.empty(n), np.empty(n, np.int64)
     S, V, lam, mean = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
     rows = 0
     for i in range(n):
@@ -125,16 +125,17 @@ def _planes(  # type: ignore[no-untyped-def]
         leverage = 1.0 + a * a / lam[1] + b * b / lam[2]
         sigma[rows] = np.sqrt(own * (1.0 + leverage / m))
         tilt[rows] = own / m * (0.5 / lam[1] + 0.5 / lam[2])
+        feature[rows] = i
         rows += 1
-    return p[:rows], c[:rows], u[:rows], sigma[:rows], tilt[:rows]
+    return p[:rows], c[:rows], u[:rows], sigma[:rows], tilt[:rows], feature[:rows]
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _lines(points, R, t, edge, keys, count, kept, table):  # type: ignore[no-untyped-def]
-    """Return p, c, u, sigma, tilt of the rows of edge points, two rows a line."""
+    """Return p, c, u, sigma, tilt, feature of the rows of edge points, two rows a line."""
     n = points.shape[0]
     p, c, u = np.empty((2 * n, 3)), np.empty((2 * n, 3)), np.empty((2 * n, 3))
-    sigma, tilt = np.empty(2 * n), np.empty(2 * n)
+    sigma, tilt, feature = np.empty(2 * n), np.empty(2 * n), np.empty(2 * n, np.int64)
     S, V, lam, mean = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
     rows = 0
     for i in range(n):
@@ -158,5 +159,6 @@ def _lines(points, R, t, edge, keys, count, kept, table):  # type: ignore[no-unt
                 u[rows, r] = V[r, k]
             sigma[rows] = np.sqrt(own * (1.0 + (1.0 + along * along / lam[2]) / m))
             tilt[rows] = own / m / lam[2]
-            rows += 1
-    return p[:rows], c[:rows], u[:rows], sigma[:rows], tilt[:rows]
+            feature[rows] = i
+        rows += 1
+    return p[:rows], c[:rows], u[:rows], sigma[:rows], tilt[:rows], feature[:rows]

@@ -12,8 +12,6 @@ import numpy as np
 
 from commonmap.types import Float64s
 
-SMALL = 1e-9
-
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def rotate(theta: Float64s, R: Float64s) -> None:
@@ -38,12 +36,35 @@ def motion_to_T(motion: Float64s) -> Float64s:
     return T
 
 
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def rotation_vector(R: Float64s) -> Float64s:
+    """Return the rotation vector (3,) of a rotation, of length 0 to pi (by its quaternion)."""
+    q = np.empty(4)
+    trace = R[0, 0] + R[1, 1] + R[2, 2]
+    if trace > 0.0:
+        q[3] = 1.0 + trace
+        q[0], q[1], q[2] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    else:
+        i = 0
+        if R[1, 1] > R[0, 0]:
+            i = 1
+        if R[2, 2] > R[i, i]:
+            i = 2
+        j, k = (i + 1) % 3, (i + 2) % 3
+        q[i] = 1.0 + R[i, i] - R[j, j] - R[k, k]
+        q[j], q[k] = R[j, i] + R[i, j], R[k, i] + R[i, k]
+        q[3] = R[k, j] - R[j, k]
+    if q[3] < 0.0:
+        q = -q
+    sine = np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
+    scale = 2.0 / q[3] if sine < 1e-12 else 2.0 * np.arctan2(sine, q[3]) / sine
+    theta: Float64s = scale * q[:3]
+    return theta
+
+
 def T_to_motion(T: Float64s) -> Float64s:
     """Return `[t, theta]` (6,) of a rigid motion; theta of length 0 to pi."""
-    from scipy.spatial.transform import Rotation
-
-    theta: Float64s = Rotation.from_matrix(T[:3, :3]).as_rotvec()
-    return np.concatenate([T[:3, 3], theta])
+    return np.concatenate([T[:3, 3], rotation_vector(T)])
 
 
 def interpolate_motion(motion: Float64s, share: float) -> Float64s:

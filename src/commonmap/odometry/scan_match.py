@@ -101,6 +101,7 @@ def _nearest(x, azimuth_x, first, last, xyz, azimuth, reach, j, least):  # type:
 def _scan_lines(points, ring, R, t, xyz, azimuth, start, reach):  # type: ignore[no-untyped-def]
     n, n_rings = points.shape[0], start.shape[0] - 1
     p, c, u = np.empty((2 * n, 3)), np.empty((2 * n, 3)), np.empty((2 * n, 3))
+    feature = np.empty(2 * n, np.int64)
     x, e = np.empty(3), np.empty(3)
     rows = 0
     for i in range(n):
@@ -149,15 +150,16 @@ def _scan_lines(points, ring, R, t, xyz, azimuth, start, reach):  # type: ignore
                 u[rows, 0] = e[1] * a3 - e[2] * a2
                 u[rows, 1] = e[2] * a1 - e[0] * a3
                 u[rows, 2] = e[0] * a2 - e[1] * a1
+            feature[rows] = i
             rows += 1
-    return p[:rows], c[:rows], u[:rows], np.full(rows, 0.1), np.zeros(rows)
+    return p[:rows], c[:rows], u[:rows], np.full(rows, 0.1), np.zeros(rows), feature[:rows]
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _scan_planes(points, ring, R, t, xyz, azimuth, start, reach):  # type: ignore[no-untyped-def]
     n, n_rings = points.shape[0], start.shape[0] - 1
     p, c, u = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
-    sigma, tilt = np.empty(n), np.empty(n)
+    sigma, tilt, feature = np.empty(n), np.empty(n), np.empty(n, np.int64)
     x, normal = np.empty(3), np.empty(3)
     rows = 0
     for i in range(n):
@@ -194,5 +196,6 @@ def _scan_planes(points, ring, R, t, xyz, azimuth, start, reach):  # type: ignor
             u[rows, r] = normal[r]
         sigma[rows] = 0.05
         tilt[rows] = 2.0 * 0.02**2 / max(gap2, 1e-4)
+        feature[rows] = i
         rows += 1
-    return p[:rows], c[:rows], u[:rows], sigma[:rows], tilt[:rows]
+    return p[:rows], c[:rows], u[:rows], sigma[:rows], tilt[:rows], feature[:rows]

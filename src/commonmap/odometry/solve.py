@@ -11,9 +11,13 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from commonmap.odometry.motion import motion_to_T
 from commonmap.types import Bools, Float64s
+
+PRETENDED = 1.25
+"""A direction with less information than so many times what noise pretends is degenerate."""
 
 BISQUARE = 4.685
 """Residuals beyond so many standard deviations do not count (Tukey's 95 % efficiency)."""
@@ -22,16 +26,22 @@ BISQUARE = 4.685
 @dataclass(frozen=True, eq=False)
 class Rows:
     """Constraints. p, c, u: (N, 3). sigma: (N,) metres, standard deviation of the distance that
-    the fit predicts. tilt: (N,) radians squared, variance of the direction of u."""
+    the fit predicts. tilt: (N,) radians squared, variance of the direction of u. feature: (N,) the
+    feature that the row is of."""
 
     p: Float64s
     c: Float64s
     u: Float64s
     sigma: Float64s
     tilt: Float64s
+    feature: NDArray[np.int64]
 
     def __len__(self) -> int:
         return len(self.p)
+
+    def refresh(self, points: Float64s) -> Rows:
+        """Return the same rows for the features' points as they are now, (M, 3)."""
+        return Rows(points[self.feature], self.c, self.u, self.sigma, self.tilt, self.feature)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,9 +148,9 @@ def bisquare(whitened: Float64s) -> tuple[Float64s, float]:
 
 def levenberg_marquardt_step(H: Float64s, g: Float64s, damping: float) -> Float64s:
     """Return the step of Eq. 8, (6,): `-(J^T J + lambda diag(J^T J))^-1 J^T d`."""
-    A: Float64s = H + np.diag(damping * np.diag(H) + 1e-12 * max(float(np.trace(H)), 1e-12))
-    step: Float64s = -np.linalg.solve(A, g)
-    return step
+    ridge = 1e-12 * max(float(np.trace(H)), 1e-12)
+    A = H + np.diag(damping * np.diag(H) + ridge)
+    return np.asarray(-np.linalg.solve(A, g), dtype=np.float64)
 
 
 def find_openness(
@@ -157,7 +167,7 @@ def find_openness(
     S = np.diag([1.0, 1.0, 1.0, 1 / lever, 1 / lever, 1 / lever])
     values, V = np.linalg.eigh(S @ H @ S)
     floor = np.einsum("ik,ij,jk->k", V, S @ noise @ S, V)
-    closed: Bools = (values > 3.0 * floor) & (values > 1.0 / tolerance**2)
+    closed: Bools = (values > PRETENDED * floor) & (values > 1.0 / tolerance**2)
     # V_u V^-1 of the paper: a step's parts along open directions are left out
     kept = V[:, closed]
     P = S @ kept @ kept.T @ np.linalg.inv(S)
