@@ -46,9 +46,8 @@ def _number(file: Path) -> int:
     return int(digits[-18:]) if digits else 0
 
 
-def open_own(path: Path, options: Options) -> Log:
+def open_own(path: Path, _: Options) -> Log:
     """Return what a folder of `write_scans` holds."""
-    _no_topic(path, options)
     times = own.scan_times(path)
     return Log(
         path=path, kind="KITTI folder (velodyne, time, ring)", n_scans=len(times),
@@ -57,17 +56,17 @@ def open_own(path: Path, options: Options) -> Log:
     )  # fmt: skip
 
 
-def iter_own(path: Path, options: Options, progress: Progress = no_progress) -> Iterator[Scan]:
+def iter_own(record: Log, options: Options, progress: Progress = no_progress) -> Iterator[Scan]:
     """Yield the scans of a folder of `write_scans`."""
+    path = record.path
     n = len(own.scan_times(path))
     for i, scan in enumerate(own.iter_scans(path)):
         progress(f"reading {path.name}", i / n)
         yield scan
 
 
-def open_folder(path: Path, options: Options) -> Log:
+def open_folder(path: Path, _: Options) -> Log:
     """Return what a folder of files, a scan each, holds."""
-    _no_topic(path, options)
     files = scan_files(path)
     if not files:
         raise InputError(f"{path} holds no scans: no .bin, .pcd or .ply, and no ROS 2 bag")
@@ -82,9 +81,9 @@ def open_folder(path: Path, options: Options) -> Log:
     )  # fmt: skip
 
 
-def iter_folder(path: Path, options: Options, progress: Progress = no_progress) -> Iterator[Scan]:
+def iter_folder(record: Log, options: Options, progress: Progress = no_progress) -> Iterator[Scan]:
     """Yield the scans of a folder of files, a scan each."""
-    open_folder(path, options)
+    path = record.path
     files = scan_files(path)
     teller = Teller(path)
     stamps = _times(path, files)
@@ -107,11 +106,6 @@ def iter_folder(path: Path, options: Options, progress: Progress = no_progress) 
             yield scan
     if not n:
         raise InputError(f"{path}: none of its {len(files)} scans has a point")
-
-
-def _no_topic(path: Path, options: Options) -> None:
-    if options.topic is not None:
-        raise InputError(f"{path} is a folder of scans: it has no topics ({options.topic!r} came)")
 
 
 def _pose_files(path: Path) -> tuple[str, ...]:

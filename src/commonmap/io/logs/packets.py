@@ -9,8 +9,7 @@ from pathlib import Path
 
 from commonmap.errors import InputError
 from commonmap.io.logs.pcap import Datagram, iter_datagrams, stream_name
-from commonmap.io.logs.record import Log, Options, Topic
-from commonmap.io.logs.rosbag import require_topic
+from commonmap.io.logs.record import Log, Options, Topic, choose_topic
 from commonmap.io.velodyne import MODEL_BYTES, PACKET_BYTES, TurnReader
 from commonmap.types import Progress, Scan, no_progress
 
@@ -41,15 +40,15 @@ def open_capture(path: Path, options: Options) -> Log:
         Topic(stream_name(*key), _model(kinds[key], options), None, "scans")
         for key in sorted(found)
     )
-    chosen = topics[0].name if len(topics) == 1 else options.topic
-    if options.topic is not None:
-        chosen = require_topic(path, topics, options.topic).name
-    return Log(path=path, kind="pcap", topics=topics, topic=chosen)
+    chosen = choose_topic(path, topics, options.topic)
+    return Log(
+        path=path, kind="pcap", topics=topics, topic=None if chosen is None else chosen.name
+    )  # fmt: skip
 
 
-def iter_capture(path: Path, options: Options, progress: Progress = no_progress) -> Iterator[Scan]:
+def iter_capture(record: Log, options: Options, progress: Progress = no_progress) -> Iterator[Scan]:
     """Yield the turns of one sensor of a capture."""
-    topic = require_topic(path, open_capture(path, options).topics, options.topic).name
+    path, topic = record.path, record.topic
     size = path.stat().st_size
     turns = TurnReader(path, options.model)
     key: tuple[bytes, int] | None = None

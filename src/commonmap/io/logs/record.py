@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from commonmap.errors import InputError
 from commonmap.io.source import log
 
 
@@ -64,3 +66,40 @@ class Teller:
         if what not in self.said:
             self.said.add(what)
             log.warning("%s: %s", self.path, what)
+
+
+def choose_topic(path: Path, topics: Sequence[Topic], wanted: str | None) -> Topic | None:
+    """Return the topic to read: the one asked for, or the only one that holds scans.
+
+    None where there are several. A topic that is not there, or holds no scans, raises.
+    """
+    with_scans = [topic for topic in topics if topic.holds == "scans" and topic.count != 0]
+    if wanted is not None:
+        for topic in topics:
+            if topic.name in (wanted, "/" + wanted):
+                if topic.holds != "scans":
+                    raise InputError(
+                        f"{path}: topic {wanted} holds {topic.type}, no scans; {_list(with_scans)}"
+                    )
+                return topic
+        raise InputError(f"{path} has no topic {wanted}; {_list(with_scans)}")
+    return with_scans[0] if len(with_scans) == 1 else None
+
+
+def require_topic(path: Path, topics: Sequence[Topic], wanted: str | None) -> Topic:
+    """Return the topic to read, or raise with the names of those there are."""
+    topic = choose_topic(path, topics, wanted)
+    if topic is not None:
+        return topic
+    with_scans = [topic for topic in topics if topic.holds == "scans" and topic.count != 0]
+    if with_scans:
+        raise InputError(f"{path} has several topics with scans, give topic: {_list(with_scans)}")
+    raise InputError(f"{path} has no topic with scans; {_list(topics)}")
+
+
+def _list(topics: Sequence[Topic]) -> str:
+    if not topics:
+        return "it has none with scans"
+    shown = ", ".join(f"{topic.name} ({topic.type}, {topic.count})" for topic in topics[:12])
+    more = f", and {len(topics) - 12} more" if len(topics) > 12 else ""
+    return f"it has {shown}{more}"

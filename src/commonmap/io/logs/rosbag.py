@@ -12,31 +12,31 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path, PosixPath
-from typing import Any, BinaryIO
+from typing import Any
 
 from commonmap.errors import InputError
+from commonmap.io.logs.livox import read_custom
 from commonmap.io.logs.pointcloud2 import CloudReader, PointCloud2, PointField
-from commonmap.io.logs.record import Log, Options, Teller, Topic
+from commonmap.io.logs.record import Log, Options, Teller, Topic, choose_topic, require_topic
 from commonmap.io.logs.salvage import salvage
 from commonmap.io.source import log, look, looks_like, parsing, reason
-from commonmap.io.velodyne import PACKET_BYTES, TurnReader
+from commonmap.io.velodyne import TurnReader
 from commonmap.types import Progress, Scan, no_progress
 
 POINTS = "sensor_msgs/msg/PointCloud2"
 PACKETS = "velodyne_msgs/msg/VelodyneScan"
-TF = "tf2_msgs/msg/TFMessage"
+TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+LIVOX = (
+    "livox_ros_driver/msg/CustomMsg",
+    "livox_ros_driver2/msg/CustomMsg",
+    "livox_interfaces/msg/CustomMsg",
+)
 POSE_TYPES = (
     "nav_msgs/msg/Odometry",
     "geometry_msgs/msg/PoseStamped",
     "geometry_msgs/msg/PoseWithCovarianceStamped",
     "geometry_msgs/msg/TransformStamped",
 )
-LIVOX = (
-    "livox_ros_driver/msg/CustomMsg",
-    "livox_ros_driver2/msg/CustomMsg",
-    "livox_interfaces/msg/CustomMsg",
-)
-
 VELODYNE_DEFINITIONS = {
     PACKETS: "std_msgs/Header header\nvelodyne_msgs/VelodynePacket[] packets\n",
     "velodyne_msgs/msg/VelodynePacket": "{time} stamp\nuint8[1206] data\n",
@@ -159,49 +159,6 @@ def open_rosbag(path: Path, options: Options) -> Log:
     )  # fmt: skip
 
 
-def choose_topic(path: Path, topics: Sequence[Topic], wanted: str | None) -> Topic | None:
-    """Return the topic to read: the one asked for, or the only one that holds scans.
-
-    None where there are several. A topic that is not there, or holds no scans, raises.
-    """
-    with_scans = [topic for topic in topics if topic.holds == "scans" and topic.count != 0]
-    if wanted is not None:
-        for topic in topics:
-            if topic.name in (wanted, "/" + wanted):
-                if topic.holds != "scans":
-                    raise InputError(
-                        f"{path}: topic {wanted} holds {topic.type}, no scans; {_list(with_scans)}"
-                    )
-                return topic
-        raise InputError(f"{path} has no topic {wanted}; {_list(with_scans)}")
-    return with_scans[0] if len(with_scans) == 1 else None
-
-
-def require_topic(path: Path, topics: Sequence[Topic], wanted: str | None) -> Topic:
-    """Return the topic to read, or raise with the names of those there are."""
-    topic = choose_topic(path, topics, wanted)
-    if topic is not None:
-        return topic
-    with_scans = [topic for topic in topics if topic.holds == "scans" and topic.count != 0]
-    if with_scans:
-        raise InputError(f"{path} has several topics with scans, give topic: {_list(with_scans)}")
-    livox = [topic.name for topic in topics if topic.type in LIVOX]
-    if livox:
-        raise InputError(
-            f"{path}: {livox[0]} is a Livox CustomMsg, which is not read; record PointCloud2 "
-            "(xfer_format 0 of the Livox driver)"
-        )
-    raise InputError(f"{path} has no topic with scans; {_list(topics)}")
-
-
-def _list(topics: Sequence[Topic]) -> str:
-    if not topics:
-        return "it has none with scans"
-    shown = ", ".join(f"{topic.name} ({topic.type}, {topic.count})" for topic in topics[:12])
-    more = f", and {len(topics) - 12} more" if len(topics) > 12 else ""
-    return f"it has {shown}{more}"
-
-
 def iter_messages(
     path: Path, topics: Sequence[str], *, keep_partial: bool = False
 ) -> Iterator[Message]:
@@ -228,44 +185,49 @@ def iter_messages(
                 yield message
 
 
-def iter_rosbag(path: Path, options: Options, progress: Progress = no_progress) -> Iterator[Scan]:
+def iter_rosbag(record: Log, options: Options, progress: Progress = no_progress) -> Iterator[Scan]:
     """Yield the scans of one topic of a bag."""
-    record = open_rosbag(path, options)
-    topic = require_topic(path, record.topics, options.topic)
+    path, topic = record.path, require_topic(record.path, record.topics, record.topic)
     first, last = record.time_span or (0.0, 0.0)
-    name = f"reading {path.name}"
-    if topic.type == PACKETS:
-        turns = TurnReader(path, options.model)
+    turns = TurnReader(path, options.model)
     clouds = CloudReader(Teller(path), deskewed=options.deskewed)
     n = 0
     for message in iter_messages(path, [topic.name], keep_partial=options.keep_partial):
-        progress(name, min((message.time * 1e-9 - first) / max(last - first, 1e-9), 1.0))
+        share = (message.time * 1e-9 - first) / max(last - first, 1e-9)
+        progress(f"reading {path.name}", min(max(share, 0.0), 1.0))
         try:
             with parsing(path, f"{topic.type} of {topic.name}"):
-                decoded = decode(message)
+                scans = list(_scans_of(message, turns, clouds))
         except InputError as error:
             if not options.keep_partial:
                 raise
             log.warning("%s; the message is left out", error)
             continue
-        if topic.type == PACKETS:
-            for packet in decoded.packets:
-                scan = turns.push(_seconds(packet.stamp), packet.data.tobytes()[:PACKET_BYTES])
-                if scan is not None:
-                    n += 1
-                    yield scan
-        else:
-            scan = clouds.scan(cloud_of(decoded))
-            if scan is not None:
-                n += 1
-                yield scan
-    if topic.type == PACKETS:
-        scan = turns.finish()
-        if scan is not None:
-            n += 1
-            yield scan
+        n += len(scans)
+        yield from scans
+    scan = turns.finish()
+    if scan is not None:
+        n += 1
+        yield scan
     if n == 0:
-        raise InputError(f"{path}: topic {topic.name} holds no points")
+        raise InputError(f"{path}: topic {topic.name} holds no points, or no whole turn")
+
+
+def _scans_of(message: Message, turns: TurnReader, clouds: CloudReader) -> Iterator[Scan]:
+    """Yield the scans that a message completes."""
+    if message.type == PACKETS:
+        for packet in decode(message).packets:
+            scan = turns.push(_seconds(packet.stamp), packet.data.tobytes())
+            if scan is not None:
+                yield scan
+        return
+    if message.type in LIVOX:
+        cloud = read_custom(message.data, is_ros1=message.is_ros1)
+    else:
+        cloud = cloud_of(decode(message))
+    scan = clouds.scan(cloud)
+    if scan is not None:
+        yield scan
 
 
 def cloud_of(message: Any) -> PointCloud2:
@@ -282,9 +244,10 @@ def cloud_of(message: Any) -> PointCloud2:
 def decode(message: Message) -> Any:
     """Return a message as the record of its type."""
     store = _store(message.is_ros1)
+    type_ = TF[0] if message.type in TF else message.type
     if message.is_ros1:
-        return store.deserialize_ros1(message.data, message.type)
-    return store.deserialize_cdr(message.data, message.type)
+        return store.deserialize_ros1(message.data, type_)
+    return store.deserialize_cdr(message.data, type_)
 
 
 def _seconds(stamp: Any) -> float:
@@ -304,9 +267,9 @@ def _store(is_ros1: bool) -> Any:
 
 
 def _holds(type_: str) -> str:
-    if type_ in (POINTS, PACKETS):
+    if type_ in (POINTS, PACKETS, *LIVOX):
         return "scans"
-    return "poses" if type_ in POSE_TYPES or type_ == TF else "other"
+    return "poses" if type_ in (*POSE_TYPES, *TF) else "other"
 
 
 def _topics(connections: Sequence[Any]) -> tuple[Topic, ...]:
@@ -324,9 +287,3 @@ def _topics(connections: Sequence[Any]) -> tuple[Topic, ...]:
 def _salvaged(path: Path) -> Iterator[Message]:
     for topic, type_, time, data, is_ros1 in salvage(bag_path(path)):
         yield Message(topic, type_, time, data, is_ros1)
-
-
-def open_binary(path: Path) -> BinaryIO:
-    """Return a file that never makes room for more bytes than it holds."""
-    file: BinaryIO = BoundedPath(path).open()
-    return file

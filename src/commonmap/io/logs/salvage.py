@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import bz2
 import struct
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from commonmap.errors import InputError
-from commonmap.io.source import log, look, looks_like
+from commonmap.io.source import log, look, looks_like, reason
 
 MAX_CHUNK = 1 << 30
 """Bytes of an unpacked chunk above which it is damaged (rosbag2 writes 768 kB to some MB)."""
@@ -37,9 +38,9 @@ def salvage(path: Path) -> Iterator[Found]:
         for found in source:
             n += 1
             yield found
-    except (struct.error, ValueError, KeyError, IndexError, OSError, EOFError, MemoryError,
-            RuntimeError) as error:  # fmt: skip
-        log.warning("%s is damaged after %d messages, which are kept (%s)", path, n, error)
+    except Exception as error:  # a parser's error on damaged bytes, as in `source.parsing`
+        log.warning("%s is damaged after %d messages, which are kept (%s)", path, n,
+                    reason(error))  # fmt: skip
         return
     log.warning("%s has no usable index: its messages are read in the order of the file", path)
 
@@ -55,7 +56,10 @@ def _unpack(kind: str, data: bytes) -> bytes:
 
         return bytes(LZ4FrameDecompressor().decompress(data, MAX_CHUNK))
     if kind == "zstd":
-        from backports.zstd import ZstdDecompressor
+        if sys.version_info >= (3, 14):
+            from compression.zstd import ZstdDecompressor
+        else:
+            from backports.zstd import ZstdDecompressor
 
         return ZstdDecompressor().decompress(data, MAX_CHUNK)
     raise ValueError(f"compression {kind!r} is not known")
@@ -118,12 +122,12 @@ def _ros1_header(data: bytes) -> dict[str, bytes]:
     return fields
 
 
-def _exact(read, length: bytes, left: int) -> bytes:  # type: ignore[no-untyped-def]
+def _exact(read: Callable[[int], bytes], length: bytes, left: int) -> bytes:
     """Return the bytes that a length of 4 bytes announces."""
     n = struct.unpack("<I", length)[0]
     if n > left:
         raise EOFError("the file ends within a record")
-    return bytes(read(n))
+    return read(n)
 
 
 def _mcap(path: Path, size: int) -> Iterator[Found]:

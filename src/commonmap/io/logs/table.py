@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from commonmap.errors import InputError, MissingExtraError
@@ -23,7 +23,7 @@ from commonmap.io.logs.folders import (
 )
 from commonmap.io.logs.packets import iter_capture, open_capture
 from commonmap.io.logs.pcap import capture_file
-from commonmap.io.logs.record import Log, Options
+from commonmap.io.logs.record import Log, Options, require_topic
 from commonmap.io.logs.rosbag import is_bag_folder, iter_rosbag, open_rosbag
 from commonmap.io.source import PathLike, look, looks_like, reason
 from commonmap.io.velodyne import check_model
@@ -40,7 +40,7 @@ class LogFormat:
     holds: str
     matches: Callable[[Path], bool]
     open: Callable[[Path, Options], Log]
-    scans: Callable[[Path, Options, Progress], Iterator[Scan]]
+    scans: Callable[[Log, Options, Progress], Iterator[Scan]]
     needs: tuple[str, ...] = ()
 
     def available(self) -> str | None:
@@ -135,8 +135,9 @@ def iter_scans(
     """
     row, path = _require(path)
     options = Options(topic, check_model(model), keep_partial, deskewed)
-    row.open(path, options)
-    return row.scans(path, options, progress)
+    record = row.open(path, options)
+    chosen = require_topic(path, record.topics, topic)
+    return row.scans(replace(record, topic=chosen.name), options, progress)
 
 
 def _require(path: PathLike) -> tuple[LogFormat, Path]:
