@@ -2,9 +2,9 @@
 
 small_gicp (generalised ICP, Segal et al. 2009) walks from the search's peak with correspondences of
 falling reach; a robust point-to-plane solve on fixed correspondences ends it and gives what the
-answer needs to be honest: residuals area by area. The covariance is the sandwich
-`H^-1 (sum over areas g_a g_a^T) H^-1` (Liang and Zeger 1986): neighbouring points err together, so
-the areas count as observations and not the points.
+answer needs to be honest: residuals area by area. Neighbouring points err together, so the areas
+count as observations and not the points: the covariance is `phi H^-1` with the overdispersion phi
+(McCullagh and Nelder 1989) that the areas show.
 """
 
 from __future__ import annotations
@@ -21,6 +21,9 @@ from scipy.spatial.transform import Rotation
 from commonmap.frames import apply, from_rotation
 from commonmap.mapping.ground import Ground
 from commonmap.types import Bools, Float64s
+
+AREAS = 4
+"""Areas along the longer side of the plan that count as observations of the pose."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,11 +234,11 @@ def _solve_point_to_plane(
     """Return (T, covariance, rms) of robust Gauss-Newton steps on point-to-plane residuals.
 
     Residual `r = n . (T p - q)`, Cauchy weights scaled by its median absolute deviation. The
-    covariance clusters the residuals by areas of the plan, about 8 x 8 of them.
+    covariance counts areas of the plan as observations (`_overdispersion`).
     """
     tree = cKDTree(target, balanced_tree=False)
     T = T.copy()
-    H, g_areas, scale = np.eye(6), np.zeros((1, 6)), float("inf")
+    H, scale = np.eye(6), float("inf")
     for _ in range(8):
         moved = apply(T, source)
         distance, index = tree.query(moved, distance_upper_bound=reach, workers=1)
@@ -250,25 +253,46 @@ def _solve_point_to_plane(
         H = (J * w[:, None]).T @ J + 1e-6 * np.eye(6) * len(p)
         g_points = J * (w * r)[:, None]
         step = -np.linalg.solve(H, g_points.sum(axis=0))
-        g_areas = _sum_by_area(p, g_points)
         T = from_rotation(Rotation.from_rotvec(step[3:]).as_matrix(), step[:3]) @ T
         if np.abs(step[:3]).max() < 1e-4 and np.abs(step[3:]).max() < 1e-5:
             break
-    inverse = np.linalg.inv(H)
-    n_areas = max(len(g_areas), 2)
-    meat = g_areas.T @ g_areas * n_areas / (n_areas - 1)
-    covariance = inverse @ meat @ inverse
-    # A grid of areas that happens to agree cannot promise more than the residuals allow
-    covariance += scale**2 * inverse + np.diag([1e-3**2] * 3 + [1e-5**2] * 3)
+    covariance = _overdispersion(p, J, w, r) * np.linalg.inv(H)
+    # Nothing is known better than to a millimetre and a thousandth of a degree
+    covariance += np.diag([1e-3**2] * 3 + [1e-5**2] * 3)
     return T, 0.5 * (covariance + covariance.T), scale
 
 
-def _sum_by_area(xyz: Float64s, g: Float64s) -> Float64s:
+def _overdispersion(
+    xyz: Float64s, J: Float64s, w: Float64s, r: Float64s, *, n_side: int = AREAS
+) -> float:
+    """Return the variance in m^2 that makes `H^-1` an honest covariance.
+
+    Every area of the plan (`n_side` along the longer side) would move by `H_a^-1 g_a` if it were
+    free. Independent noise of variance v lets `g_a^T H_a^-1 g_a / 6` be v on average; an area that
+    is drifted, bent or differently seen as a whole makes it as much larger as there are points
+    that err together.
+    """
     low, high = xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0)
-    size = max(float((high - low).max()) / 8.0, 1e-6)
+    size = max(float((high - low).max()) / n_side, 1e-6)
     ij = np.floor((xyz[:, :2] - low) / size).astype(np.int64)
-    _, inverse = np.unique(ij[:, 0] * 1024 + ij[:, 1], return_inverse=True)
-    return np.column_stack([np.bincount(inverse, weights=g[:, a]) for a in range(6)])
+    _, area = np.unique(ij[:, 0] * 1024 + ij[:, 1], return_inverse=True)
+    found, weight = [], []
+    for a in range(int(area.max()) + 1):
+        inside = area == a
+        if np.count_nonzero(inside) < 30:
+            continue
+        J_a, w_a = J[inside], w[inside]
+        g = J_a.T @ (w_a * r[inside])
+        H_a = (J_a * w_a[:, None]).T @ J_a
+        H_a += 1e-3 * np.trace(H_a) / 6.0 * np.diag(np.diag(H_a) / max(np.diag(H_a).mean(), 1e-12))
+        found.append(float(g @ np.linalg.solve(H_a, g)) / 6.0)
+        weight.append(float(w_a.sum()))
+    noise = float((w * r**2).sum() / max(w.sum() - 6.0, 1.0))
+    if len(found) < 3:
+        return noise * max(1.0, len(r) / 50.0)
+    # Six parameters were fitted to the areas: what they took away is given back
+    share = max(len(found) - 1.0, 1.0) / len(found)
+    return max(noise, float(np.average(found, weights=weight)) / share)
 
 
 def share_of_inliers(
