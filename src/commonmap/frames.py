@@ -19,14 +19,14 @@ def check_T(T: ArrayLike, name: str = "T") -> Float64s:
     """Return `T` as a float64 (4, 4) rigid motion, or raise `InputError` naming what came."""
     matrix = np.asarray(T, dtype=np.float64)
     if matrix.shape != (4, 4):
-        raise InputError(f"{name} must be a 4x4 rigid motion; an array of shape {matrix.shape} came")
+        raise InputError(f"{name} must be a 4x4 rigid motion; shape {matrix.shape} came")
     if not np.isfinite(matrix).all():
         raise InputError(f"{name} must hold finite numbers; it holds NaN or infinity")
     if not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-9):
         raise InputError(f"{name} must end in the row 0 0 0 1; the row is {matrix[3].tolist()}")
     R = matrix[:3, :3]
     if not np.allclose(R @ R.T, np.eye(3), atol=1e-5) or np.linalg.det(R) < 0:
-        raise InputError(f"{name} must be a rotation and a translation; its 3x3 part is no rotation")
+        raise InputError(f"{name} must turn and shift only; its 3x3 part is no rotation")
     return matrix
 
 
@@ -110,5 +110,5 @@ def rotation_between(a: ArrayLike, b: ArrayLike) -> Float64s:
         if cosine > 0:
             return np.eye(3)
         axis = np.cross(u, np.eye(3)[int(np.argmin(np.abs(u)))])
-        return Rotation.from_rotvec(np.pi * axis / np.linalg.norm(axis)).as_matrix()
-    return Rotation.from_rotvec(axis / sine * np.arctan2(sine, cosine)).as_matrix()
+        return np.asarray(Rotation.from_rotvec(np.pi * axis / np.linalg.norm(axis)).as_matrix())
+    return np.asarray(Rotation.from_rotvec(axis / sine * np.arctan2(sine, cosine)).as_matrix())

@@ -76,7 +76,7 @@ class Leaves:
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """One turn of a lidar, as measured: not deskewed, every point in the sensor frame of its moment.
+    """One turn of a lidar, as measured: not deskewed, each point in the frame of its moment.
 
     xyz: (N, 3) float32 metres, sensor frame (x forward, y left, z up).
     time: (N,) float64 seconds, on the clock of the log.

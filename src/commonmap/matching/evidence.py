@@ -184,10 +184,11 @@ def evidence_surface(
     target_side = correlate(s_known, target.occupied)
     both = correlate(s_occupied, target.occupied)
     n_u, n_v = (t + s - 1 for t, s in zip(target.shape, occupied.shape, strict=True))
-    return _evidence_from_counts(
+    score, overlap = _evidence_from_counts(
         pairs, source_side, target_side, both, occupied.shape[0], occupied.shape[1],
         n_u, n_v, float(min_overlap), xlogx_table(int(np.count_nonzero(known)) + 1),
     )  # fmt: skip
+    return score, overlap
 
 
 def xlogx_table(n_max: int) -> Float64s:

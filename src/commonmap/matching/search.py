@@ -145,7 +145,8 @@ def evidence_at(target: SlabGrid, columns: Columns, pose: Float64s) -> tuple[flo
         columns.known, columns.n_slabs, np.asarray(pose, np.float64)[None],
     )[0]  # fmt: skip
     xlogx = xlogx_table(int(table[:, 0].max(initial=0)) + 1)
-    return float(sum(signed_evidence(*row, xlogx) for row in table)), int(table[:, 0].max())
+    total = sum(signed_evidence(n, r, c, n11, xlogx) for n, r, c, n11 in table)
+    return float(total), int(table[:, 0].max())
 
 
 def _at_cell(target: SlabGrid, source: SlabGrid, cell: float) -> tuple[SlabGrid, Columns]:
