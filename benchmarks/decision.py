@@ -2,6 +2,7 @@
 
     python benchmarks/decision.py collect --first 0 --pairs 60     # appends to records/decision.jsonl
     python benchmarks/decision.py fit                              # prints the weights for decide.py
+    python benchmarks/decision.py draw                             # docs/images/decision.png
     python benchmarks/decision.py show [--from 1000]               # success, refusals, false accepts
 
 A case is a pair of robots in one simulated place (overlap 0.12 to 1, drift 0 to 1 %, tilt to 1
@@ -155,10 +156,47 @@ def show(first: int) -> None:
             print(f"  {low:.2f} to {min(high, 1):.2f}  {inside.sum():4d}  {right[inside].mean():.2f}")
 
 
+def draw(path: Path) -> None:
+    """Draw all cases: what they exceed a mirrored map and the second pose by, and prominence."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    records = load(0, 1 << 40)
+    names, X, _ = design(records)
+    right = np.array([r["right"] for r in records])
+    same = np.array([r["label"] == "same place" for r in records])
+    from commonmap.matching.decide import WEIGHTS
+
+    x, y = X[:, names.index("ratios")], X[:, names.index("prominence")]
+    figure, axis = plt.subplots(figsize=(7, 4.6), dpi=110)
+    for mask, colour, marker, label in (
+        (right, "#2a78d6", "o", "same place, pose right"),
+        (same & ~right, "#d9541e", "s", "same place, pose wrong"),
+        (~same, "#6b6b6b", "x", "another place"),
+    ):
+        axis.scatter(x[mask], y[mask], s=22, c=colour, marker=marker, label=label, alpha=0.75)
+    at = np.log(ACCEPT_AT / (1 - ACCEPT_AT))
+    line = np.linspace(x.min(), x.max(), 2)
+    for inliers, style in ((0.0, "-"), (0.3, "--")):
+        edge = at - WEIGHTS["bias"] - WEIGHTS["inliers"] * inliers - WEIGHTS["ratios"] * line
+        axis.plot(line, edge / WEIGHTS["prominence"], style, color="#333333", lw=1,
+                  label=f"accepted right of here, inlier surplus {inliers:g}")
+    axis.set_ylim(0, y.max() * 1.05)
+    axis.set_xlabel("ln (best / mirrored) + ln (best / second)")
+    axis.set_ylabel("ln prominence over all headings")
+    axis.legend(fontsize=8, loc="lower right")
+    for side in ("top", "right"):
+        axis.spines[side].set_visible(False)
+    figure.tight_layout()
+    figure.savefig(path)
+
+
 def main() -> None:
     """Run the command named on the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("job", nargs="?", default="show", choices=["collect", "fit", "show"])
+    parser.add_argument("job", nargs="?", default="show", choices=["collect", "fit", "show", "draw"])
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--pairs", type=int, default=60)
     parser.add_argument("--from", dest="start", type=int, default=0)
@@ -167,6 +205,8 @@ def main() -> None:
         collect(options.first, options.pairs)
     elif options.job == "fit":
         fit()
+    elif options.job == "draw":
+        draw(Path(__file__).parents[1] / "docs" / "images" / "decision.png")
     else:
         show(options.start)
 
