@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from commonmap.io.formats import find_reader
-from commonmap.io.scans import iter_scans, scan_times
+from commonmap.io.logs import find_log, iter_scans, open_log
+from commonmap.io.logs.packets import survey_capture
 from commonmap.io.source import PathLike
 from commonmap.types import Cloud, Float64s, Leaves
 
@@ -24,17 +26,19 @@ SPACINGS_PER_CELL = 4.0
 
 
 def describe(path: PathLike) -> dict[str, Any]:
-    """Return what a map file, or a folder of scans, holds.
+    """Return what a map file, or a log of a lidar, holds.
 
     Keys of every kind: path, kind ("cloud", "octree", "scans"), format, bytes. Of a cloud: points,
     min and max (x, y, z, metres), extent, spacing (median distance to the nearest neighbour,
     metres), density (points per square metre of the area they cover), crs (name or None), colour,
     intensity, origin (bool), time_span (seconds, or None). Of an octree: leaves, occupied, free,
-    resolution, min, max, extent. Of scans: scans, points_first, rings, time_span.
+    resolution, min, max, extent. Of scans: scans (None where the log does not say), points_first,
+    rings (channels seen by the first scan), time_span (or None); of a bag or a capture also topics,
+    topic (the one with the scans, None where there are several) and poses (topics with poses).
     """
     path = Path(path)
-    if path.is_dir():
-        return {"path": str(path), **_of_scans(path)}
+    if path.is_dir() or find_log(path) is not None:
+        return {"path": str(path), **_of_log(path)}
     reader = find_reader(path)
     map_ = reader.load(path)
     common = {
@@ -122,18 +126,31 @@ def _of_octree(leaves: Leaves) -> dict[str, Any]:
     }
 
 
-def _of_scans(folder: Path) -> dict[str, Any]:
-    times = scan_times(folder)
-    first = next(iter_scans(folder))
+def _of_log(path: Path) -> dict[str, Any]:
+    record = open_log(path)
+    if record.kind == "pcap" and record.topic is not None:
+        n_scans, span = survey_capture(record, record.topic)
+        record = replace(record, n_scans=n_scans, time_span=span)
+    chosen = record.topic is not None or not record.topics
+    first = next(iter_scans(path)) if chosen else None
+    files = [file for file in path.rglob("*") if file.is_file()] if path.is_dir() else [path]
     return {
         "kind": "scans",
-        "format": "KITTI folder (velodyne, time, ring)",
-        "bytes": sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()),
-        "scans": len(times),
-        "points_first": len(first.xyz),
-        "rings": len(np.unique(first.ring)),
-        "time_span": [float(times[0]), float(times[-1])],
-    }
+        "format": record.kind,
+        "bytes": sum(file.stat().st_size for file in files),
+        "scans": record.n_scans,
+        "points_first": None if first is None else len(first.xyz),
+        "rings": None if first is None else len(np.unique(first.ring)),
+        "time_span": None if record.time_span is None else list(record.time_span),
+    } | (
+        {}
+        if not record.topics
+        else {
+            "topics": [f"{topic.name} ({topic.type})" for topic in record.topics],
+            "topic": record.topic,
+            "poses": list(record.poses),
+        }
+    )
 
 
 def _crs_name(crs: str) -> str:

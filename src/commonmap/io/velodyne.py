@@ -193,8 +193,8 @@ class TurnReader:
         """Return the last turn, if it is whole; say what was lost."""
         done = None
         if self._turn:
-            number = int(self._turn_number())
-            covered = min(self._turn[-1].turn_end, number + 1) - max(self._turn[0].turn, number)
+            # to where in its turn the log goes
+            covered = self._turn[-1].turn_end - int(self._turn_number())
             done = self._emit() if covered >= WHOLE_TURN else None
         if self.n_damaged:
             log.warning("%s: %d of %d packets are damaged and left out", self.path,

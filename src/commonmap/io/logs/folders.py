@@ -14,7 +14,7 @@ import numpy as np
 from commonmap.errors import InputError
 from commonmap.io import scans as own
 from commonmap.io.logs.derive import rings_of, times_of
-from commonmap.io.logs.record import Log, Options, Teller, Topic
+from commonmap.io.logs.record import Log, Options, Teller
 from commonmap.io.source import log, parsing
 from commonmap.types import Float64s, Progress, Scan, no_progress
 
@@ -51,7 +51,6 @@ def open_own(path: Path, _: Options) -> Log:
     times = own.scan_times(path)
     return Log(
         path=path, kind="KITTI folder (velodyne, time, ring)", n_scans=len(times),
-        topics=(Topic("velodyne", "KITTI .bin", len(times), "scans"),), topic="velodyne",
         time_span=(float(times[0]), float(times[-1])), poses=_pose_files(path),
     )  # fmt: skip
 
@@ -74,8 +73,6 @@ def open_folder(path: Path, _: Options) -> Log:
     suffix = files[0].suffix.lower()
     return Log(
         path=path, kind=f"folder of {suffix}", n_scans=len(files),
-        topics=(Topic(files[0].parent.name, suffix, len(files), "scans"),),
-        topic=files[0].parent.name,
         time_span=None if times is None else (float(times[0]), float(times[-1])),
         poses=_pose_files(path),
     )  # fmt: skip

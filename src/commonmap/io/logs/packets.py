@@ -46,6 +46,20 @@ def open_capture(path: Path, options: Options) -> Log:
     )  # fmt: skip
 
 
+def survey_capture(record: Log, topic: str) -> tuple[int, tuple[float, float]]:
+    """Return how many turns a sensor of a capture makes, about, and when: reads it all."""
+    turned, before, first, last = 0, None, 0.0, 0.0
+    for datagram in iter_datagrams(record.path, keep_partial=True):
+        if len(datagram.payload) != PACKET_BYTES or datagram.stream != topic:
+            continue
+        azimuth = int.from_bytes(datagram.payload[2:4], "little")
+        step = 0 if before is None else (azimuth - before) % 36000
+        turned += step if step < 18000 else 0
+        before, last = azimuth, datagram.time
+        first = first or last
+    return round(turned / 36000), (first, last)
+
+
 def iter_capture(record: Log, options: Options, progress: Progress = no_progress) -> Iterator[Scan]:
     """Yield the turns of one sensor of a capture."""
     path, topic = record.path, record.topic

@@ -29,7 +29,7 @@ class Topic:
 class Log:
     """What is known of a log before it is read.
 
-    kind: name of its row in `LOGS`. topics: all of them. topic: the one whose scans are read,
+    kind: in words. topics: all of them; a folder has none. topic: the one whose scans are read,
     None where the choice is the user's. n_scans: how many there are, where known. time_span:
     (first, last) in seconds on the clock of the log, where known. poses: topics, or files beside
     the log, that hold poses of the robot from elsewhere.

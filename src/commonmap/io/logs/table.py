@@ -136,8 +136,11 @@ def iter_scans(
     row, path = _require(path)
     options = Options(topic, check_model(model), keep_partial, deskewed)
     record = row.open(path, options)
-    chosen = require_topic(path, record.topics, topic)
-    return row.scans(replace(record, topic=chosen.name), options, progress)
+    if record.topics:
+        record = replace(record, topic=require_topic(path, record.topics, topic).name)
+    elif topic is not None:
+        raise InputError(f"{path} is a folder of scans: it has no topics ({topic!r} came)")
+    return row.scans(record, options, progress)
 
 
 def _require(path: PathLike) -> tuple[LogFormat, Path]:
