@@ -17,6 +17,7 @@ import numpy as np
 from scipy import ndimage
 
 from commonmap.errors import EmptyMapError
+from commonmap.mapping.points import bounds
 from commonmap.types import Bools, Float64s
 
 MAX_SLOPE = math.tan(math.radians(38.0))
@@ -52,8 +53,9 @@ def find_ground(xyz: Float64s, *, cell: float | None = None) -> Ground:
         raise EmptyMapError(f"a map needs at least three points to have a ground; {len(xyz)} came")
     if cell is None:
         cell = max(0.5, 1.5 * typical_spacing(xyz))
-    origin = np.floor(xyz[:, :2].min(axis=0) / cell) * cell
-    shape = tuple(np.floor((xyz[:, :2].max(axis=0) - origin) / cell).astype(int) + 1)
+    low, high = bounds(xyz)
+    origin = np.floor(low[:2] / cell) * cell
+    shape = tuple(np.floor((high[:2] - origin) / cell).astype(int) + 1)
     lowest = _lowest(np.ascontiguousarray(xyz, dtype=np.float64), origin, cell, *shape)
     lowest = _drop_low_blunders(lowest, cell)
     tolerance = 0.15 + 0.1 * cell
@@ -80,18 +82,28 @@ def typical_spacing(xyz: Float64s) -> float:
     The share of occupied cells of a 1 m grid is known; within them n points on an area A lie
     about sqrt(A / n) apart. Robust against unequal density: the median over cells.
     """
-    extent = np.ptp(xyz[:, :2], axis=0)
+    low, high = bounds(xyz)
+    extent = (high - low)[:2]
     coarse = max(1.0, float(extent.max()) / 4096.0)
     for _ in range(4):
-        index = np.floor((xyz[:, :2] - xyz[:, :2].min(axis=0)) / coarse).astype(np.int64)
-        _, counts = np.unique(
-            index[:, 0] * (index[:, 1].max() + 1) + index[:, 1], return_counts=True
-        )
+        n_x, n_y = (int(n) for n in np.floor(extent / coarse) + 1)
+        counts = _count(np.ascontiguousarray(xyz, dtype=np.float64), low, coarse, n_x, n_y)
+        counts = counts[counts > 0]
         median = float(np.median(counts))
         if median >= 4 or len(counts) < 16:
             break
         coarse *= 2.0
     return float(coarse / math.sqrt(max(median, 1.0)))
+
+
+@numba.njit(cache=True)  # type: ignore[misc]
+def _count(xyz, low, cell, n_x, n_y):  # type: ignore[no-untyped-def]
+    count = np.zeros(n_x * n_y, np.int32)
+    for n in range(xyz.shape[0]):
+        i = min(int((xyz[n, 0] - low[0]) / cell), n_x - 1)
+        j = min(int((xyz[n, 1] - low[1]) / cell), n_y - 1)
+        count[i * n_y + j] += 1
+    return count
 
 
 def fill(z: Float64s) -> Float64s:

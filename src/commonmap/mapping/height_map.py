@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from commonmap.errors import EmptyMapError, InputError
 from commonmap.mapping.ground import Ground, find_ground, typical_spacing
+from commonmap.mapping.points import bounds, sample
 from commonmap.types import Float64s, GridMap
 
 NICE_CELLS = (0.05, 0.1, 0.2, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
@@ -42,7 +43,7 @@ def choose_cell(target_xyz: Float64s, source_xyz: Float64s) -> float:
 
 def robust_extent(xyz: Float64s) -> float:
     """Return the wider side in metres of the box that holds the middle 98 % of the points."""
-    low, high = np.quantile(xyz[:, :2], [0.01, 0.99], axis=0)
+    low, high = np.quantile(sample(xyz, 200_000)[:, :2], [0.01, 0.99], axis=0)
     return float((high - low).max())
 
 
@@ -100,8 +101,9 @@ def build_height_map(
             f"no point lies between 1 m below the ground and {limit:g} m above it; nothing to match"
         )
     points, height = np.ascontiguousarray(xyz[used]), height[used]
-    origin = np.floor(points[:, :2].min(axis=0) / cell) * cell
-    n_x, n_y = np.floor((points[:, :2].max(axis=0) - origin) / cell).astype(int) + 1
+    low, high = bounds(points)
+    origin = np.floor(low[:2] / cell) * cell
+    n_x, n_y = np.floor((high[:2] - origin) / cell).astype(int) + 1
     count, top, lowest, highest, bits = _fill_columns(
         points, height, origin, cell, int(n_x), int(n_y), np.asarray(slab_edges, np.float64)
     )

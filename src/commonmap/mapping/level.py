@@ -17,6 +17,7 @@ import numpy as np
 
 from commonmap.frames import apply, from_rotation, rotation_between
 from commonmap.mapping.ground import find_ground
+from commonmap.mapping.points import sample
 from commonmap.types import Float64s
 
 MAX_SIGMA = math.radians(2.0)
@@ -24,6 +25,9 @@ MAX_SIGMA = math.radians(2.0)
 
 FINEST_STEP = math.radians(0.5)
 """The last grid of directions is this fine or finer; a paraboloid through it gives the answer."""
+
+MOST_POINTS = 600_000
+"""Points that are looked at, at even steps through the cloud."""
 
 PRIOR_TILT = math.radians(1.5)
 """How far from level a map is expected to be that says it is (standard deviation)."""
@@ -56,7 +60,8 @@ def find_level(xyz: Float64s) -> Levelling:
     """
     if len(xyz) < 200:
         return no_levelling("too few points to tell which way is up")
-    centred = xyz - np.median(xyz, axis=0)
+    centred = sample(xyz, MOST_POINTS)
+    centred = centred - np.median(centred, axis=0)
 
     # Roughly up: the map's own z, unless another direction has ground under everything
     up, own = _rough_up(centred)

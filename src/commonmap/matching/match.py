@@ -16,7 +16,7 @@ from commonmap.frames import apply, from_rotation, from_xyz_yaw, invert
 from commonmap.mapping.ground import Ground, find_ground
 from commonmap.mapping.height_map import build_height_map, choose_cell, choose_slabs
 from commonmap.mapping.level import Levelling, find_level, no_levelling
-from commonmap.mapping.points import points_of
+from commonmap.mapping.points import bounds, points_of, sample
 from commonmap.matching.decide import Figures, Verdict, decide
 from commonmap.matching.evidence import (
     Columns,
@@ -146,9 +146,10 @@ def match(
 def prepare(item: Cloud | Leaves | Float64s, name: str, config: Config) -> Prepared:
     """Return a map with its points level and near the origin, and its ground."""
     xyz = points_of(item, name)
-    middle = np.round(np.median(xyz, axis=0))
+    middle = np.round(np.median(sample(xyz, 100_000), axis=0))
     local = xyz - middle
-    extent = np.ptp(local[:, :2], axis=0)
+    low, high = bounds(local)
+    extent = (high - low)[:2]
     if len(local) < 100 or float(extent.max()) < 1.0:
         raise EmptyMapError(
             f"the {name} has {len(local)} points over {extent[0]:.2g} x {extent[1]:.2g} m; a map "

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from commonmap.frames import apply, from_rotation
 from commonmap.mapping.ground import Ground
+from commonmap.mapping.points import bounds
 from commonmap.types import Bools, Float64s
 
 AREAS = 4
@@ -93,7 +94,8 @@ def refine(
     """
     start = np.asarray(T_target_source, dtype=np.float64)
     moved_source = apply(start, source_xyz)
-    low, high = moved_source.min(axis=0) - 2.0 * cell, moved_source.max(axis=0) + 2.0 * cell
+    low, high = bounds(moved_source)
+    low, high = low - 2.0 * cell, high + 2.0 * cell
     inside = _inside(target_xyz, low, high)
     if np.count_nonzero(inside) < 20 or len(source_xyz) < 20:
         return _unrefined(start, source_xyz)
@@ -308,7 +310,8 @@ def share_of_inliers(
     draft = draft[:: len(draft) // 20_000 + 1]
     if len(draft) == 0 or not target_standing.any():
         return 0.0
-    low, high = draft.min(axis=0) - reach, draft.max(axis=0) + reach
+    low, high = bounds(draft)
+    low, high = low - reach, high + reach
     inside = _inside(target[:, :2], low, high)
     base = thin(target[inside], 0.5 * reach, 1_000_000) if inside.any() else target[:0]
     upright = target[inside & target_standing]
