@@ -105,9 +105,10 @@ def _rings_by_elevation(elevation: Float64s) -> NDArray[np.uint16]:
     stops = np.flatnonzero(full & ~np.concatenate([full[1:], [False]])) + 1
     middle = (edges[starts] + edges[stops]) / 2
     if not 4 <= len(middle) <= 256:  # no clusters: equal slices, as many as a common sensor has
-        return np.clip((elevation - low) / max(high - low, 1e-9) * 64, 0, 63).astype(np.uint16)
+        slices = (elevation - low) / max(float(high - low), 1e-9) * 64
+        return np.array(np.clip(slices, 0, 63), dtype=np.uint16)
     between = (middle[1:] + middle[:-1]) / 2
-    ring: NDArray[np.int64] = np.searchsorted(between, elevation)
+    ring = np.searchsorted(between, elevation)
     return np.array(ring, dtype=np.uint16)
 
 

@@ -7,7 +7,7 @@ stands in docs/odometry.md.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,13 @@ from commonmap.types import Float64s, Scan
 
 STILL = np.zeros(6)
 
+LEAST_MATCHED = 30
+LEAST_SHARE = 0.15
+"""Below so many matched features, or so small a share of those that looked, odometry is lost."""
+
+FALL = 0.5
+"""Odometry is lost where that share falls below so much of what it was in the turns before."""
+
 
 @dataclass(frozen=True)
 class LoamOptions:
@@ -40,7 +47,8 @@ class LoamOptions:
     n_planar: planar points a turn to register to the map, about.
     scan_rounds, map_rounds: how often partners are looked for, at most.
     tolerance: metres; a direction whose pose would be less certain is degenerate.
-    deskew: whether the points were measured while the sensor moved.
+    deskew: whether the points were measured while the sensor moved; None tries both on the first
+        turns where the log has no time per point, and is True else.
     """
 
     voxel: float | None = None
@@ -50,7 +58,7 @@ class LoamOptions:
     scan_rounds: int = 2
     map_rounds: int = 4
     tolerance: float = 0.1
-    deskew: bool = True
+    deskew: bool | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +94,8 @@ class Loam:
         self._last: Taken | None = None
         self._rate: Float64s = STILL  # motion per second of the last turn, its own frame
         self._deskew_rate_last: Float64s = STILL
+        self._stamp = 0.0
+        self._share = 0.0  # of features that match, running mean of the turns that were not lost
         self._cell = 0.0
         self._cropped: Float64s = np.zeros(3)
 
@@ -96,7 +106,11 @@ class Loam:
         turn = arrange(scan)
         if not self.poses:
             self._begin(turn)
+            self._stamp = scan.stamp
             return
+        if not turn.moment > self.moments[-1]:  # an empty turn, or one stray early point
+            turn = replace(turn, moment=self.moments[-1] + max(scan.stamp - self._stamp, 1e-3))
+        self._stamp = scan.stamp
         taken = self._take(turn)
         dt = turn.moment - self.moments[-1]
         # scan to scan: the prior
@@ -153,7 +167,7 @@ class Loam:
     def _unskew(
         self, points: Float64s, delay: Float64s, rate: Float64s, bend: Float64s
     ) -> Float64s:
-        return deskew(points, delay, rate, bend) if self.options.deskew else points
+        return points if self.options.deskew is False else deskew(points, delay, rate, bend)
 
     # ------------------------------------------------------------ scan to scan
 
@@ -223,7 +237,7 @@ class Loam:
                 lines = match_lines(edge, T, self.edges)
                 asked = T
             rows = join(planes.refresh(planar), lines.refresh(edge))
-            if len(rows) < 30:
+            if len(rows) < LEAST_MATCHED:
                 break
             T_new, open_, w = self._solve(T, rows, iterations=2)
             step = self._moved(T, T_new)
@@ -232,8 +246,10 @@ class Loam:
                 break
         self._deskew_rate_last = sweep_motion(T_to_motion(invert(T) @ self.poses[-1]), dt)[0]
         n_matched = int((w > 0).sum())
-        share = n_matched / max(looked, 1)
-        lost = n_matched < 30 or share < 0.1
+        share = min(n_matched / max(looked, 1), 1.0)
+        lost = n_matched < LEAST_MATCHED or share < max(LEAST_SHARE, FALL * self._share)
+        if not lost:
+            self._share += 0.1 * (share - self._share) if self._share else share
         R = T[:3, :3]
         degenerate = np.zeros((0, 6)) if open_ is None else open_.directions
         degenerate = np.hstack([degenerate[:, :3] @ R.T, degenerate[:, 3:] @ R.T])

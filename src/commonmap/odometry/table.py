@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
+from itertools import chain, islice
 
 import numpy as np
 
@@ -24,11 +25,12 @@ log = logging.getLogger(__name__)
 class OdometryMethod:
     """A row of the table.
 
-    run: takes scans (ring and time per point), the options and the progress; gives the answer.
+    run: takes scans (ring and time per point), the options, the progress and the notes on what was
+        derived of the scans; gives the answer.
     extra: the optional package it needs, empty for none. needs_poses: poses must be given.
     """
 
-    run: Callable[[Iterable[Scan], LoamOptions, Progress], Odometry] | None
+    run: Callable[[Iterable[Scan], LoamOptions, Progress, list[str]], Odometry] | None
     summary: str
     extra: str = ""
     needs_poses: bool = False
@@ -69,7 +71,7 @@ def estimate(
     assert row.run is not None
     notes: list[str] = []
     completed = complete_scans(check_order(scans), notes)
-    answer = row.run(completed, options or LoamOptions(), progress)
+    answer = row.run(completed, options or LoamOptions(), progress, notes)
     for note in notes:
         log.warning("%s", note)
     return Odometry(answer.method, answer.trajectory, answer.health, (*notes, *answer.notes))
@@ -98,17 +100,51 @@ def check_order(scans: Iterable[Scan]) -> Iterator[Scan]:
         raise InputError("odometry needs at least one scan; none came")
 
 
-def estimate_loam(scans: Iterable[Scan], options: LoamOptions, progress: Progress) -> Odometry:
-    """Return the trajectory by LOAM."""
-    loam = Loam(options)
+TRIAL_TURNS = 10
+"""Turns on which both readings of a log without times are tried."""
+
+
+def estimate_loam(
+    scans: Iterable[Scan], options: LoamOptions, progress: Progress, derived: list[str]
+) -> Odometry:
+    """Return the trajectory by LOAM. derived: notes on what was derived of the scans so far."""
     progress("odometry")
-    for number, scan in enumerate(scans):
+    stream = iter(scans)
+    first = list(islice(stream, TRIAL_TURNS))
+    notes: tuple[str, ...] = ()
+    if options.deskew is None and any("no time per point" in note for note in derived):
+        options, note = try_deskew(first, options)
+        notes = (note,)
+    loam = Loam(options)
+    for number, scan in enumerate(chain(first, stream)):
         loam.add(scan)
         if number % 50 == 49:
             progress(f"odometry, {number + 1} turns")
     loam.finish()
     trajectory = Trajectory(np.array(loam.moments), np.array(loam.poses))
-    return Odometry("loam", trajectory, tuple(loam.health), describe_health(loam.health))
+    notes += describe_health(loam.health)
+    return Odometry("loam", trajectory, tuple(loam.health), notes)
+
+
+def try_deskew(first: list[Scan], options: LoamOptions) -> tuple[LoamOptions, str]:
+    """Return the options with `deskew` set as the first turns fit better, and a note on it.
+
+    A log without times may hold turns that its maker has already deskewed.
+    """
+    residual = []
+    for deskew in (True, False):
+        loam = Loam(replace(options, deskew=deskew))
+        for scan in first:
+            loam.add(scan)
+        known = [h.residual for h in loam.health[2:] if np.isfinite(h.residual)]
+        residual.append(float(np.mean(known)) if known else np.inf)
+    chosen = residual[0] < residual[1]
+    does = "deskewed here" if chosen else "taken as already deskewed"
+    note = (
+        f"the scans are {does}: features lie within {residual[0] * 1e3:.1f} mm of the map with "
+        f"deskewing by the derived times and within {residual[1] * 1e3:.1f} mm without"
+    )
+    return replace(options, deskew=chosen), note
 
 
 def describe_health(health: list[ScanHealth]) -> tuple[str, ...]:
@@ -151,8 +187,14 @@ def take_poses(scans: Iterable[Scan], poses: Trajectory, progress: Progress) -> 
     return Odometry("poses", Trajectory(np.asarray(poses.time, np.float64), T), ())
 
 
-def _run_kiss_icp(scans: Iterable[Scan], options: LoamOptions, progress: Progress) -> Odometry:
-    return estimate_kiss_icp(scans, voxel=None, deskew=options.deskew, progress=progress)
+def _run_kiss_icp(
+    scans: Iterable[Scan], options: LoamOptions, progress: Progress, derived: list[str]
+) -> Odometry:
+    """Return the trajectory by KISS-ICP; scans with derived times are not deskewed."""
+    stream = iter(scans)
+    first = list(islice(stream, 1))
+    deskew = not derived if options.deskew is None else options.deskew
+    return estimate_kiss_icp(chain(first, stream), deskew=deskew, progress=progress)
 
 
 ODOMETRY: dict[str, OdometryMethod] = {
