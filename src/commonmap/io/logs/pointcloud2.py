@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from commonmap.errors import InputError
 from commonmap.io.logs.derive import rings_of, times_of
-from commonmap.io.logs.record import Teller
+from commonmap.io.logs.record import Teller, shown
 from commonmap.types import Float64s, Scan
 
 DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
@@ -41,7 +41,7 @@ NANOSECONDS = ("t", "offset_time", "time_stamp", "time_offset")
 LONGEST_TURN = 2.0
 """Seconds: what tells the unit of a time that is not an integer."""
 
-USUAL_CHANNELS = (1, 4, 5, 6, 8, 12, 16, 20, 32, 40, 64, 80, 96, 128, 192, 256)
+USUAL_CHANNELS = (16, 20, 32, 40, 64, 80, 96, 128, 192, 256)
 MAX_CHANNELS = 4096
 
 
@@ -92,11 +92,12 @@ def columns_of(cloud: PointCloud2) -> dict[str, NDArray[Any]]:
     columns = {}
     for item in cloud.fields:
         if item.datatype not in DATATYPES:
-            raise InputError(f"field {item.name!r} has the unknown datatype {item.datatype}")
+            raise InputError(f"field {shown(item.name)!r} has the unknown datatype {item.datatype}")
         dtype = np.dtype((">" if cloud.is_bigendian else "<") + DATATYPES[item.datatype])
         if item.offset < 0 or item.offset + dtype.itemsize > step:
             raise InputError(
-                f"field {item.name!r} at byte {item.offset} does not fit a point of {step} bytes"
+                f"field {shown(item.name)!r} at byte {item.offset} does not fit a point of "
+                f"{step} bytes"
             )
         columns[item.name] = np.ndarray(
             (height, width), dtype, buffer=data, offset=item.offset, strides=(row, step)
@@ -117,6 +118,7 @@ class CloudReader:
     _period: float = 0.1
     _stamp: float | None = None
     _rank: NDArray[np.uint16] | None = None
+    _highest: int = 0
     _names: dict[str, str | None] = field(default_factory=dict)
 
     def scan(self, cloud: PointCloud2) -> Scan | None:
@@ -126,7 +128,7 @@ class CloudReader:
         if missing:
             raise InputError(
                 f"{self.teller.path}: its points need x, y and z; they have "
-                f"{', '.join(item.name for item in cloud.fields) or 'no fields'}"
+                f"{', '.join(shown(item.name) for item in cloud.fields[:20]) or 'no fields'}"
             )
         planes = [columns[name].astype(np.float32).ravel() for name in "xyz"]
         xyz = np.stack(planes, axis=1) if len(planes[0]) else np.empty((0, 3), np.float32)
@@ -170,7 +172,9 @@ class CloudReader:
         else:
             self.teller.tell("its points name no channel: it is told from their elevation")
             return rings_of(xyz)
-        if self._rank is None:
+        if self._rank is None or raw.max() > self._highest:
+            # numbers beyond those seen so far: the sensor has more channels than was thought
+            self._highest = max(self._highest, _round_up(int(raw.max())))
             self._rank = _ranking(raw, xyz, min(height, width))
         return np.asarray(self._rank[raw])
 
@@ -212,6 +216,11 @@ class CloudReader:
             rest = values - whole * per_second
         result: Float64s = whole + rest * self._unit
         return result
+
+
+def _round_up(top: int) -> int:
+    """Return the highest number of a lidar that has a channel `top`."""
+    return next((n for n in USUAL_CHANNELS if n > top), MAX_CHANNELS) - 1
 
 
 def _first(names: Sequence[str], columns: Mapping[str, Any]) -> str | None:
@@ -260,11 +269,10 @@ def _ranking(
         return table
     top = int(ids[-1]) + 1
     if rising.mean() <= 0.1:
-        n = (
-            n_organised
-            if n_organised >= top
-            else next((c for c in USUAL_CHANNELS if c >= top), top)
-        )
+        n = max(n_organised, top)
+        if n not in USUAL_CHANNELS:
+            # the first scan does not hold the last channels: the lowest, or those in the sky
+            n = min(1 << (n - 1).bit_length(), MAX_CHANNELS)
         table[:n] = np.arange(n)[::-1]
         return table
     unseen = np.setdiff1d(np.arange(top), ids)

@@ -15,7 +15,7 @@ import numpy as np
 from commonmap.errors import InputError
 from commonmap.frames import check_T, from_quaternion, invert
 from commonmap.io.logs.livox import read_custom
-from commonmap.io.logs.record import Options, Topic
+from commonmap.io.logs.record import Options, Topic, shown
 from commonmap.io.logs.rosbag import (
     LIVOX,
     POINTS,
@@ -120,13 +120,13 @@ def _from_bag(path: Path, topic: str | None, sensor: str | None, fixed: str | No
     motions: list[Float64s] = []
     child = ""
     for message in iter_messages(path, [chosen.name]):
-        with parsing(path, f"{chosen.type} of {chosen.name}"):
+        with parsing(path, f"{shown(chosen.type)} of {shown(chosen.name)}"):
             child, time, T = _pose_of(message)
         if not times or time > times[-1]:
             times.append(time)
             motions.append(T)
     if not times:
-        raise InputError(f"{path}: topic {chosen.name} holds no poses")
+        raise InputError(f"{path}: topic {shown(chosen.name)} holds no poses")
     T_map_child = np.array(motions)
     if child and sensor and child != sensor:
         edges = _edges(path, record.topics, only_static=True)
@@ -134,7 +134,7 @@ def _from_bag(path: Path, topic: str | None, sensor: str | None, fixed: str | No
         if T_child_sensor is None:
             log.warning(
                 "%s: the poses are of %s, the scans of %s, and no /tf_static joins them; they are "
-                "taken for one frame", path, child, sensor,
+                "taken for one frame", path, shown(child), shown(sensor),
             )  # fmt: skip
         else:
             T_map_child = T_map_child @ T_child_sensor
@@ -142,7 +142,7 @@ def _from_bag(path: Path, topic: str | None, sensor: str | None, fixed: str | No
 
 
 def _choose(path: Path, topics: list[Topic], wanted: str | None) -> Topic:
-    names = ", ".join(f"{t.name} ({t.type})" for t in topics) or "none"
+    names = ", ".join(f"{shown(t.name)} ({shown(t.type)})" for t in topics) or "none"
     if wanted is not None:
         for topic in topics:
             if topic.name in (wanted, "/" + wanted):
@@ -161,7 +161,7 @@ def _frame_of_scans(path: Path, topics: Iterable[Topic], chosen: str | None) -> 
     for topic in topics:
         if topic.holds == "scans" and chosen in (None, topic.name):
             for message in iter_messages(path, [topic.name]):
-                with parsing(path, f"{topic.type} of {topic.name}"):
+                with parsing(path, f"{shown(topic.type)} of {shown(topic.name)}"):
                     if topic.type in LIVOX:
                         return read_custom(message.data, is_ros1=message.is_ros1).frame
                     decoded = decode(message)
@@ -204,7 +204,7 @@ def _edges(path: Path, topics: Iterable[Topic], *, only_static: bool = False) ->
     names = [t.name for t in topics if t.type in TF and (not only_static or "static" in t.name)]
     edges: Edges = {}
     for message in iter_messages(path, names) if names else ():
-        with parsing(path, f"TFMessage of {message.topic}"):
+        with parsing(path, f"TFMessage of {shown(message.topic)}"):
             transforms = decode(message).transforms
             for item in transforms:
                 child = str(item.child_frame_id).lstrip("/")
@@ -224,7 +224,7 @@ def _chain(edges: Edges, frame: str, top: str | None = None) -> list[str]:
     while chain[-1] in edges and chain[-1] != top:
         parent = edges[chain[-1]][0]
         if parent in chain:
-            raise InputError(f"the frames of /tf go in a circle at {parent!r}")
+            raise InputError(f"the frames of /tf go in a circle at {shown(parent)}")
         chain.append(parent)
     return chain
 
@@ -252,14 +252,19 @@ def _from_tf(
     edges = _edges(path, topics)
     if sensor is None or sensor.lstrip("/") not in edges:
         raise InputError(
-            f"{path}: /tf does not tell where {sensor!r} is; it has {', '.join(sorted(edges)[:20])}"
+            f"{path}: /tf does not tell where {shown(str(sensor))} is; it has "
+            f"{', '.join(map(shown, sorted(edges)[:20]))}"
         )
     chain = _chain(edges, sensor.lstrip("/"), None if fixed is None else fixed.lstrip("/"))
     if fixed is not None and chain[-1] != fixed.lstrip("/"):
-        raise InputError(f"{path}: /tf leads from {sensor} to {chain[-1]}, not to {fixed}")
+        raise InputError(
+            f"{path}: /tf leads from {shown(sensor)} to {shown(chain[-1])}, not to {fixed}"
+        )
     moving = [frame for frame in chain[:-1] if not edges[frame][3]]
     if not moving:
-        raise InputError(f"{path}: between {chain[-1]} and {sensor} nothing moves in /tf")
+        raise InputError(
+            f"{path}: between {shown(chain[-1])} and {shown(sensor)} nothing moves in /tf"
+        )
     densest = max(moving, key=lambda frame: len(edges[frame][1]))
     times = np.array(edges[densest][1])
     for frame in moving:

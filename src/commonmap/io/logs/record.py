@@ -79,7 +79,8 @@ def choose_topic(path: Path, topics: Sequence[Topic], wanted: str | None) -> Top
             if topic.name in (wanted, "/" + wanted):
                 if topic.holds != "scans":
                     raise InputError(
-                        f"{path}: topic {wanted} holds {topic.type}, no scans; {_list(with_scans)}"
+                        f"{path}: topic {wanted} holds {shown(topic.type)}, no scans; "
+                        f"{_list(with_scans)}"
                     )
                 return topic
         raise InputError(f"{path} has no topic {wanted}; {_list(with_scans)}")
@@ -97,9 +98,17 @@ def require_topic(path: Path, topics: Sequence[Topic], wanted: str | None) -> To
     raise InputError(f"{path} has no topic with scans; {_list(topics)}")
 
 
+def shown(name: str) -> str:
+    """Return a name from a file as part of a sentence: short, on one line."""
+    text = "".join(c if c.isprintable() else "?" for c in name)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
 def _list(topics: Sequence[Topic]) -> str:
     if not topics:
         return "it has none with scans"
-    shown = ", ".join(f"{topic.name} ({topic.type}, {topic.count})" for topic in topics[:12])
+    listed = ", ".join(
+        f"{shown(topic.name)} ({shown(topic.type)}, {topic.count})" for topic in topics[:12]
+    )
     more = f", and {len(topics) - 12} more" if len(topics) > 12 else ""
-    return f"it has {shown}{more}"
+    return f"it has {listed}{more}"

@@ -17,7 +17,7 @@ from typing import Any
 from commonmap.errors import InputError
 from commonmap.io.logs.livox import read_custom
 from commonmap.io.logs.pointcloud2 import CloudReader, PointCloud2, PointField
-from commonmap.io.logs.record import Log, Options, Teller, Topic, choose_topic, require_topic
+from commonmap.io.logs.record import Log, Options, Teller, Topic, choose_topic, require_topic, shown
 from commonmap.io.logs.salvage import salvage
 from commonmap.io.source import log, look, looks_like, parsing, reason
 from commonmap.io.velodyne import TurnReader
@@ -196,7 +196,7 @@ def iter_rosbag(record: Log, options: Options, progress: Progress = no_progress)
         share = (message.time * 1e-9 - first) / max(last - first, 1e-9)
         progress(f"reading {path.name}", min(max(share, 0.0), 1.0))
         try:
-            with parsing(path, f"{topic.type} of {topic.name}"):
+            with parsing(path, f"{shown(topic.type)} of {shown(topic.name)}"):
                 scans = list(_scans_of(message, turns, clouds))
         except InputError as error:
             if not options.keep_partial:
@@ -210,7 +210,7 @@ def iter_rosbag(record: Log, options: Options, progress: Progress = no_progress)
         n += 1
         yield scan
     if n == 0:
-        raise InputError(f"{path}: topic {topic.name} holds no points, or no whole turn")
+        raise InputError(f"{path}: topic {shown(topic.name)} holds no points, or no whole turn")
 
 
 def _scans_of(message: Message, turns: TurnReader, clouds: CloudReader) -> Iterator[Scan]:
