@@ -413,8 +413,13 @@ def test_interrupt_while_writing_leaves_what_was_there(
 def test_a_signal_ends_a_real_run_cleanly(
     folder: Path, tmp_path: Path, number: signal.Signals
 ) -> None:
+    # A shell that starts us in the background makes us ignore SIGINT: undo that in the child
+    listening = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "from commonmap.cli import main; main()"
+    )
     command = [
-        sys.executable, "-m", "commonmap.cli", "run", str(folder / "base.ply"),
+        sys.executable, "-c", listening, "run", str(folder / "base.ply"),
         str(folder / "draft.ply"), "-o", str(tmp_path / "out"),
     ]  # fmt: skip
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
