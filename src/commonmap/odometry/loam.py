@@ -192,7 +192,7 @@ class Loam:
             )
             if len(rows) < 20:
                 break
-            T_new, _, _ = self._solve(T, rows, iterations=3)
+            T_new, _, _ = self._solve(T, rows, None)
             step = self._moved(T, T_new)
             T = T_new
             new_rate, _ = sweep_motion(T_to_motion(invert(T)), dt)
@@ -235,11 +235,11 @@ class Loam:
             if asked is None or self._moved(asked, T) > 0.2 * self.voxel:
                 planes = match_planes(planar, T, self.fine, self.coarse)
                 lines = match_lines(edge, T, self.edges)
-                asked = T
+                asked, open_ = T, None
             rows = join(planes.refresh(planar), lines.refresh(edge))
             if len(rows) < LEAST_MATCHED:
                 break
-            T_new, open_, w = self._solve(T, rows, iterations=2)
+            T_new, open_, w = self._solve(T, rows, open_)
             step = self._moved(T, T_new)
             T = T_new
             if step < 0.01 * self.voxel:
@@ -266,14 +266,19 @@ class Loam:
         return float(np.linalg.norm(step[:3]) + self.lever * np.linalg.norm(step[3:]))
 
     def _solve(
-        self, T: Float64s, rows: Rows, *, iterations: int
+        self, T: Float64s, rows: Rows, open_: Openness | None
     ) -> tuple[Float64s, Openness, Float64s]:
-        """Return the pose after a few steps of Levenberg-Marquardt with robust weights."""
+        """Return the pose after a few steps of Levenberg-Marquardt with robust weights.
+
+        open_: what the same rows leave open, where it was found before.
+        """
         R, t = np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy()
         robust, spread = bisquare(residuals(R, t, rows.p, rows.c, rows.u) / rows.sigma)
         w = robust / (spread * rows.sigma) ** 2
-        open_ = find_openness(R, rows, w, lever=self.lever, tolerance=self.options.tolerance)
-        return minimise(T, rows, w, open_, iterations=iterations), open_, w
+        if open_ is None:
+            tolerance = self.options.tolerance
+            open_ = find_openness(R, rows, w, lever=self.lever, tolerance=tolerance)
+        return minimise(T, rows, w, open_, iterations=2), open_, w
 
     # ------------------------------------------------------------ the map
 
