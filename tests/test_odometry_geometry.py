@@ -11,7 +11,13 @@ from scipy.spatial.transform import Rotation
 from commonmap.frames import from_rotation, invert
 from commonmap.odometry.distances import eigen3, point_to_line, point_to_plane
 from commonmap.odometry.features import choose, exclude, noise_floor, roughness
-from commonmap.odometry.geometry import complete_scan, derive_rings, derive_times
+from commonmap.odometry.geometry import (
+    complete_scan,
+    complete_scans,
+    derive_rings,
+    derive_times,
+    find_lack,
+)
 from commonmap.odometry.local_map import LocalMap, thin
 from commonmap.odometry.motion import (
     T_to_motion,
@@ -380,16 +386,24 @@ def turn_of_vlp16(rng: np.random.Generator) -> tuple[Scan, np.ndarray]:
 def test_rings_and_times_are_derived_and_told() -> None:
     scan, (time, ring) = turn_of_vlp16(np.random.default_rng(5))
     notes: list[str] = []
-    whole = complete_scan(scan, 0.1, notes)
+    whole = complete_scan(scan, 0.1, notes, find_lack(scan))
     assert np.array_equal(whole.ring, ring)
-    assert (
-        np.abs(whole.time - 7.0 - time).max() < 2e-4
-        or np.median(np.abs(whole.time - 7.0 - time)) < 2e-4
-    )
+    assert np.quantile(np.abs(whole.time - 7.0 - time), 0.99) < 2e-4
     assert len(notes) == 2 and "16 rings" in notes[0] and "time per point" in notes[1]
-    complete_scan(scan, 0.1, notes)
+    complete_scan(scan, 0.1, notes, find_lack(scan))
     assert len(notes) == 2
-    assert complete_scan(whole, 0.1, []) is whole
+    assert find_lack(whole) == (False, False)
+
+
+def test_a_sparse_turn_does_not_make_a_log_lack_rings() -> None:
+    scan, (time, ring) = turn_of_vlp16(np.random.default_rng(5))
+    full = Scan(scan.xyz, time + 7.0, ring.astype(np.uint16), scan.intensity, 7.0)
+    one = np.flatnonzero(ring == 3)[:4]
+    late = time[one] + 7.1
+    sparse = Scan(scan.xyz[one], late, full.ring[one], scan.intensity[one], 7.1)
+    notes: list[str] = []
+    assert list(complete_scans([sparse, full, sparse], notes)) == [sparse, full, sparse]
+    assert notes == []
 
 
 def test_rings_are_derived_from_points_in_the_order_of_rings() -> None:

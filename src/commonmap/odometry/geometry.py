@@ -14,38 +14,59 @@ PERIOD = 0.1
 BINS = 4096
 
 
+ENOUGH = 500
+"""A turn of so many points tells whether its log holds rings and times; a sparse one may have a
+single ring by chance."""
+
+
 def complete_scans(scans: Iterable[Scan], notes: list[str]) -> Iterator[Scan]:
-    """Yield the scans; those without rings or times get them, which is told once in `notes`."""
+    """Yield the scans; those of a log without rings or times get them, told once in `notes`.
+
+    The first turn of `ENOUGH` points decides for the log.
+    """
     period = PERIOD
+    lacks: tuple[bool, bool] | None = None
     waiting: Scan | None = None
     for scan in scans:
         if waiting is not None:
             period = min(scan.stamp - waiting.stamp, 10 * PERIOD)
-            yield complete_scan(waiting, period, notes)
+            lacks = find_lack(waiting) if lacks is None else lacks
+            yield complete_scan(waiting, period, notes, lacks)
         waiting = scan
     if waiting is not None:
-        yield complete_scan(waiting, period, notes)
+        lacks = find_lack(waiting) if lacks is None else lacks
+        yield complete_scan(waiting, period, notes, lacks)
 
 
-def complete_scan(scan: Scan, period: float, notes: list[str]) -> Scan:
-    """Return the scan with rings from elevation and times from azimuth where it has none.
+def find_lack(scan: Scan) -> tuple[bool, bool] | None:
+    """Return whether a log lacks rings and whether it lacks times, None where a turn cannot tell.
 
-    A scan has no rings or times where all its points have the same. period: seconds a turn.
+    It lacks them where all points of a turn have the same.
     """
-    if len(scan.xyz) < 2:
+    if len(scan.xyz) < ENOUGH:
+        return None
+    return int(scan.ring.max()) == int(scan.ring.min()), float(np.ptp(scan.time)) == 0.0
+
+
+def complete_scan(
+    scan: Scan, period: float, notes: list[str], lacks: tuple[bool, bool] | None
+) -> Scan:
+    """Return the scan with rings from elevation and times from azimuth where its log lacks them.
+
+    period: seconds a turn. lacks: rings, times; as `find_lack` found them.
+    """
+    if lacks is None or not any(lacks) or not len(scan.xyz):
         return scan
     ring, time = scan.ring, scan.time
-    if int(ring.max()) == int(ring.min()):
-        ring, wraps = derive_rings(scan.xyz)
-        how = "the order of the points" if wraps else "their elevation"
+    if lacks[0]:
+        ring, ordered = derive_rings(scan.xyz)
+        how = "the order of the points" if ordered else "their elevation"
         note = f"the log has no ring numbers: {int(ring.max()) + 1} rings were derived from {how}"
         _tell(notes, note, "the log has no ring")
-    if float(time.max()) == float(time.min()):
+    if lacks[1]:
         time = derive_times(scan.xyz, ring, scan.stamp, period)
         note = "the log has no time per point: times were derived from the azimuth of the points"
         _tell(notes, note, "the log has no time")
-    if ring is scan.ring and time is scan.time:
-        return scan
     return Scan(scan.xyz, time, ring, scan.intensity, scan.stamp)
 
 
