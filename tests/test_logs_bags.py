@@ -15,6 +15,7 @@ from commonmap.errors import CommonmapError, InputError, MissingExtraError
 from commonmap.frames import from_xyz_yaw, invert
 from commonmap.io import describe, write_trajectory
 from commonmap.io.logs import LOGS, find_log, iter_scans, open_log, read_poses
+from commonmap.io.logs.derive import find_seam
 from commonmap.sim.logs import LAYOUTS, write_kitti, write_mcap, write_pcap
 from commonmap.types import Cloud, Float64s, Scan, Trajectory
 from lidar_scans import vlp16_scans
@@ -254,7 +255,7 @@ def test_file_names_that_are_times(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not (SHARED / "lidar-log").is_dir(), reason="no shared data beside the project")
 def test_real_scans_of_64_beams() -> None:
-    scans = iter_scans(SHARED / "lidar-log" / "scans")
+    scans = iter_scans(SHARED / "lidar-log" / "scans", deskewed=False)
     for scan, _ in zip(scans, range(3), strict=False):
         assert 120_000 < len(scan.xyz) < 125_000
         assert len(np.unique(scan.ring)) == 64
@@ -266,6 +267,37 @@ def test_real_scans_of_64_beams() -> None:
         # within a channel, time follows the order of the file
         follows = [np.mean(np.diff(scan.time[scan.ring == k]) >= 0) for k in range(64)]
         assert min(follows) > 0.98
+
+
+@pytest.mark.skipif(not (SHARED / "lidar-log").is_dir(), reason="no shared data beside the project")
+def test_real_scans_are_found_to_be_deskewed(caplog: pytest.LogCaptureFixture) -> None:
+    scan = next(iter_scans(SHARED / "lidar-log" / "scans"))
+    assert set(scan.time.tolist()) == {0.0}
+    assert "moved to one moment (the scans break at" in caplog.text
+
+
+def on_flat_ground(step: float, *, deskewed: bool) -> Scan:
+    """Return a turn of 32 channels over a plane 1.7 m below, moving `step` m along x in it."""
+    share = np.tile(np.arange(1800) / 1800, 32)
+    ring = np.repeat(np.arange(32), 1800).astype(np.uint16)
+    down = np.radians(np.linspace(25.0, 5.0, 32))[ring]
+    azimuth = np.pi - 2 * np.pi * share
+    reach = 1.7 / np.tan(down)
+    xyz = np.column_stack([reach * np.cos(azimuth), reach * np.sin(azimuth), -1.7 + 0 * reach])
+    if deskewed:
+        xyz[:, 0] += step * (share - 0.5)
+    n = len(ring)
+    return Scan(xyz.astype(np.float32), share, ring, np.ones(n, np.float32), 0.0)
+
+
+def test_a_seam_is_found_only_where_points_were_moved() -> None:
+    moved = on_flat_ground(0.8, deskewed=True)
+    seam = find_seam(moved.xyz, moved.ring)
+    assert seam is not None
+    assert abs(np.degrees(seam.azimuth)) == pytest.approx(180.0, abs=1.0)
+    assert abs(seam.jump) == pytest.approx(0.8, abs=0.05)
+    for scan in (on_flat_ground(0.8, deskewed=False), on_flat_ground(0.05, deskewed=True)):
+        assert find_seam(scan.xyz, scan.ring) is None
 
 
 # poses

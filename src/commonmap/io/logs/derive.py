@@ -6,6 +6,7 @@ approximations: the lasers do not start in one point, and a turn is not perfectl
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -16,6 +17,11 @@ from commonmap.types import Float32s, Float64s
 MAX_RINGS = 256
 BIN = np.radians(0.01)
 """Width of a bin of elevation, radians."""
+
+SEAM_BINS = 720
+SEAM_REACH = 20.0
+SEAM_JUMP = 0.15
+"""Metres by which the channels must break for a turn to count as deskewed."""
 
 VALLEY = 0.6
 """A valley between two channels holds at most this share of the lower of them."""
@@ -152,3 +158,53 @@ def _valleys(smooth: Float64s) -> list[int] | None:
             shallow += 1
         edges.append(cut)
     return edges if shallow * 20 <= len(edges) else None
+
+
+@dataclass(frozen=True)
+class Seam:
+    """Where a turn begins and ends, in points that were moved to one moment.
+
+    azimuth: radians. jump: metres by which all channels break there.
+    """
+
+    azimuth: float
+    jump: float
+
+
+def find_seam(xyz: Float32s, ring: NDArray[np.uint16]) -> Seam | None:
+    """Return the seam of a turn that was deskewed while the sensor moved, None where there is none.
+
+    As measured, a channel draws an unbroken line on the ground. Points that were moved to one
+    moment break where the turn begins and ends: there the first and the last were moved apart by
+    the way of the whole turn, and so in every channel, near and far, by the same length. No edge
+    of a thing in the world does that.
+    """
+    if len(xyz) < 1000:
+        return None
+    flat = np.hypot(xyz[:, 0], xyz[:, 1]).astype(np.float64)
+    azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
+    column = np.minimum(
+        ((azimuth + np.pi) / (2 * np.pi) * SEAM_BINS).astype(np.int64), SEAM_BINS - 1
+    )
+    n_rings = int(ring.max()) + 1
+    cell = ring.astype(np.int64) * SEAM_BINS + column
+    count = np.bincount(cell, minlength=n_rings * SEAM_BINS).astype(np.float64)
+    total = np.bincount(cell, weights=flat, minlength=n_rings * SEAM_BINS)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = (total / count).reshape(n_rings, SEAM_BINS)
+    far = [np.roll(mean, shift, axis=1) for shift in (4, 2, -1, -3)]
+    # the break between the bins to the left and right, less the slope on either side
+    jump = far[2] - far[1] - 0.75 * ((far[1] - far[0]) + (far[3] - far[2]))
+    best: Seam | None = None
+    # near the sensor, where unevenness of the ground moves the line little
+    with np.errstate(invalid="ignore"):
+        known = np.isfinite(jump) & (far[1] < SEAM_REACH)
+    for b in np.flatnonzero(known.sum(axis=0) >= 6):
+        values, reach = jump[known[:, b], b], far[1][known[:, b], b]
+        middle = float(np.median(values))
+        if abs(middle) < SEAM_JUMP or (best is not None and abs(middle) < abs(best.jump)):
+            continue
+        agree = np.abs(values - middle) < max(0.05, 0.15 * abs(middle))
+        if agree.mean() >= 0.6 and reach[agree].max() > 2.0 * reach[agree].min():
+            best = Seam(float(-np.pi + 2 * np.pi * b / SEAM_BINS), middle)
+    return best

@@ -7,16 +7,20 @@ Without times, scans are taken to follow each other at 10 Hz; the user is told.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from commonmap.errors import InputError
 from commonmap.io import scans as own
-from commonmap.io.logs.derive import rings_of, times_of
+from commonmap.io.logs.derive import Seam, find_seam, rings_of, times_of
 from commonmap.io.logs.record import Log, Options, Teller
 from commonmap.io.source import log, parsing
 from commonmap.types import Float64s, Progress, Scan, no_progress
+
+LOOKED_AT = 8
+"""Scans that tell whether those of a folder were deskewed."""
 
 RATE = 10.0
 """Scans a second where nothing says it."""
@@ -88,6 +92,8 @@ def iter_folder(record: Log, options: Options, progress: Progress = no_progress)
         teller.tell(f"it has no times.txt: scans are taken to come {RATE:g} times a second")
         stamps = np.arange(len(files)) / RATE
     period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0 / RATE
+    if options.deskewed is None and not _has_times(files[0]):
+        options = replace(options, deskewed=_look_deskewed(files, teller))
     n = 0
     for i, (file, stamp) in enumerate(zip(files, stamps, strict=True)):
         progress(f"reading {path.name}", i / len(files))
@@ -103,6 +109,44 @@ def iter_folder(record: Log, options: Options, progress: Progress = no_progress)
             yield scan
     if not n:
         raise InputError(f"{path}: none of its {len(files)} scans has a point")
+
+
+def _has_times(file: Path) -> bool:
+    """Return whether the points of a file have times of their own."""
+    if file.suffix.lower() == ".bin":
+        return False
+    from commonmap.io.formats import read_cloud
+
+    try:
+        return read_cloud(file).time is not None
+    except InputError:
+        return False
+
+
+def _look_deskewed(files: list[Path], teller: Teller) -> bool:
+    """Return whether some of the scans show, at one azimuth, the seam of a turn deskewed."""
+    seams: list[Seam] = []
+    chosen = files[:: max(1, len(files) // LOOKED_AT)][:LOOKED_AT]
+    for file in chosen:
+        try:
+            scan = _read(file, 0.0, 0.1, Options(deskewed=True), Teller(file, silent=True))
+        except InputError:
+            continue
+        seam = None if scan is None else find_seam(scan.xyz, scan.ring)
+        if seam is not None:
+            seams.append(seam)
+    if len(seams) < 3:
+        return False
+    azimuth = np.array([seam.azimuth for seam in seams])
+    close = np.abs(np.angle(np.exp(1j * (azimuth[:, None] - azimuth)))) < np.radians(2.0)
+    if close.sum(axis=1).max() < max(3, 0.6 * len(seams)):
+        return False
+    where = np.degrees(azimuth[int(close.sum(axis=1).argmax())])
+    teller.tell(
+        f"its points were moved to one moment (the scans break at {where:.0f} deg): each has the "
+        "time of its scan"
+    )
+    return True
 
 
 def _pose_files(path: Path) -> tuple[str, ...]:
@@ -166,15 +210,15 @@ def _read(file: Path, stamp: float, period: float, options: Options, teller: Tel
     xyz = xyz[kept]
     teller.tell("its points name no channel: it is told from their order or elevation")
     ring = rings_of(xyz)
-    if options.deskewed:
-        time = np.full(len(xyz), stamp)
-    elif time is not None:
+    if time is not None and not options.deskewed:
         time = time[kept]
         time = time if abs(float(time.min())) > 10.0 else stamp + time
+    elif options.deskewed:
+        time = np.full(len(xyz), stamp)
     else:
         teller.tell(
             "its points have no time: it is told from their azimuth (say deskewed if they were "
-            "moved to one moment, as those of the KITTI odometry set were)"
+            "moved to one moment)"
         )
         time = times_of(xyz, ring, stamp, period)
     return Scan(

@@ -51,7 +51,7 @@ class Options:
     topic: str | None = None
     model: str | None = None
     keep_partial: bool = False
-    deskewed: bool = False
+    deskewed: bool | None = None
 
 
 @dataclass
@@ -59,11 +59,12 @@ class Teller:
     """Says a thing about a log once, however often it happens."""
 
     path: Path
+    silent: bool = False
     said: set[str] = field(default_factory=set)
 
     def tell(self, what: str) -> None:
         """Warn that `what` holds for the log, unless it was said before."""
-        if what not in self.said:
+        if what not in self.said and not self.silent:
             self.said.add(what)
             log.warning("%s: %s", self.path, what)
 

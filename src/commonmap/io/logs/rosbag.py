@@ -190,7 +190,7 @@ def iter_rosbag(record: Log, options: Options, progress: Progress = no_progress)
     path, topic = record.path, require_topic(record.path, record.topics, record.topic)
     first, last = record.time_span or (0.0, 0.0)
     turns = TurnReader(path, options.model)
-    clouds = CloudReader(Teller(path), deskewed=options.deskewed)
+    clouds = CloudReader(Teller(path), deskewed=bool(options.deskewed))
     n = 0
     for message in iter_messages(path, [topic.name], keep_partial=options.keep_partial):
         share = (message.time * 1e-9 - first) / max(last - first, 1e-9)

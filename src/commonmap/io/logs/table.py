@@ -118,7 +118,7 @@ def open_log(
 
 def iter_scans(
     path: PathLike, *, topic: str | None = None, model: str | None = None,
-    keep_partial: bool = False, deskewed: bool = False, progress: Progress = no_progress,
+    keep_partial: bool = False, deskewed: bool | None = None, progress: Progress = no_progress,
 ) -> Iterator[Scan]:  # fmt: skip
     """Yield the scans of a log one at a time, in the order of recording.
 
@@ -126,8 +126,9 @@ def iter_scans(
     model: of a Velodyne, a name of `velodyne.MODELS`, where its packets do not tell.
     keep_partial: keep what can be read of a log that is truncated or damaged; else it raises
         `InputError` at the fault.
-    deskewed: the points of a scan were moved to one moment by whoever made the log; they get its
-        stamp as their time. For logs whose points have no time of their own.
+    deskewed: the points of a scan were moved to one moment by whoever made the log (as those of
+        the KITTI odometry set were); they get its stamp as their time. None looks at some scans
+        of a folder whose points have no time, and takes it as given where they show it.
 
     Points without finite coordinates, or at the sensor, are left out. Channel and time are those
     of the log where it has them; else they are told from the geometry, with a warning of the
