@@ -205,21 +205,23 @@ def main() -> int:
     parser.add_argument("-o", "--output", type=Path, default=RECORDS / "odometry.json")
     args = parser.parse_args()
     rows = []
+    args.output.parent.mkdir(exist_ok=True)
     for row in run_all(args):
         rows.append(row)
         print(
             f"{row['world']:10s} {row['robot']:7s} {row['method']:8s} voxel {row['voxel_m']:.2f}  "
             f"ATE {row['ate_m']:7.3f} m  segment {row['segment_percent']:6.2f} %  "
-            f"{row['ms_median']:5.1f} ms", flush=True,
-        )  # fmt: skip
+            f"{row['ms_median']:5.1f} ms",
+            flush=True,
+        )
+        record = {
+            "command": " ".join(["python benchmarks/odometry.py", *sys.argv[1:]]),
+            "machine": platform.processor() or platform.machine(),
+            "python": platform.python_version(),
+            "rows": rows,
+        }
+        args.output.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     print("\n".join(table(rows)))
-    record = {
-        "command": "python benchmarks/odometry.py " + " ".join(sys.argv[1:]),
-        "machine": platform.processor() or platform.machine(), "python": platform.python_version(),
-        "rows": rows,
-    }  # fmt: skip
-    args.output.parent.mkdir(exist_ok=True)
-    args.output.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     return 0
 
 
