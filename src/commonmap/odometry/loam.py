@@ -81,9 +81,9 @@ class Taken:
 
 
 class Loam:
-    """The state of the odometry. Feed turns in order of time with `add`, end with `finish`.
+    """The state of the odometry. Feed turns in order of time with `add`.
 
-    poses, moments, health: one a turn so far. The last pose may still change with the next turn.
+    poses, moments, health: one a turn so far.
     """
 
     def __init__(self, options: LoamOptions | None = None):
@@ -124,11 +124,6 @@ class Loam:
         self._keep_last()
         self._rate = self._motion_of(T_map_turn, dt)
         self._last = taken
-
-    def finish(self) -> None:
-        """Take the last turn into the map."""
-        if self._last is not None:
-            self._keep_last()
 
     def _begin(self, turn: Turn) -> None:
         """Derive the lengths from the first turn and make the maps."""

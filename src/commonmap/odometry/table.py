@@ -120,7 +120,6 @@ def estimate_loam(
         loam.add(scan)
         if number % 50 == 49:
             progress(f"odometry, {number + 1} turns")
-    loam.finish()
     trajectory = Trajectory(np.array(loam.moments), np.array(loam.poses))
     notes += describe_health(loam.health)
     return Odometry("loam", trajectory, tuple(loam.health), notes)
