@@ -152,8 +152,8 @@ def prepare(item: Cloud | Leaves | Float64s, name: str, config: Config) -> Prepa
     extent = (high - low)[:2]
     if len(local) < 100 or float(extent.max()) < 1.0:
         raise EmptyMapError(
-            f"the {name} has {len(local)} points over {extent[0]:.2g} x {extent[1]:.2g} m; a map "
-            "needs at least 100 points over a metre"
+            f"the {name} has only {len(local)} finite points over {extent[0]:.2g} x "
+            f"{extent[1]:.2g} m; a map needs at least 100 points over a metre"
         )
     if float(extent.max()) > 100_000:
         raise InputError(

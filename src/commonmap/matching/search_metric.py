@@ -14,8 +14,12 @@ import numpy as np
 
 from commonmap.matching import correlate
 from commonmap.matching.search import Peaks, local_maxima, separate
-from commonmap.metrics.table import METRICS
+from commonmap.metrics.plans import DifferenceSum, JointHistogram, MinSum, Smooth
+from commonmap.metrics.table import find_metric
 from commonmap.types import Float64s, GridMap, Progress, no_progress
+
+_WEIGHT = {Smooth: 2.0, JointHistogram: 6.0, MinSum: 16.0, DifferenceSum: 16.0}
+"""Time of one pose by kind of plan, in units of the plain sums."""
 
 
 def search_metric(
@@ -35,13 +39,16 @@ def search_metric(
     """Return the best separate poses of `source` on `target` (height maps on half the finest cell).
 
     The scores in the answer are turned so that more is better. Cells are as fine as `budget`
-    (padded cells times yaws) allows. Other arguments as in `search` and `correlate`.
+    (padded cells times yaws, of a plain sum) allows. Other arguments as in `search` and
+    `correlate`.
     """
     xy, height = _columns(source)
     centre = 0.5 * (xy.min(axis=0) + xy.max(axis=0))
     xy = (xy - centre) * np.array([-1.0 if mirrored else 1.0, 1.0])
     reach = float(np.hypot(*xy.T).max())
     radius = float(np.quantile(np.hypot(*xy.T), 0.98))
+    row = find_metric(metric)
+    budget /= _WEIGHT.get(type(row.fft), 1.0)
     factor = 2
     while True:
         cell = factor * target.cell
@@ -60,7 +67,6 @@ def search_metric(
     low = np.full(2, -0.5 * side * cell)
     _, known_0 = scatter_heights(xy, height, 1.0, 0.0, cell, low, side, side)
     n_known = int(np.count_nonzero(known_0))
-    row = METRICS[metric]
     prepared = correlate.prepare_target(
         row,
         height_t,
