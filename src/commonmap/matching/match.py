@@ -12,7 +12,7 @@ import numpy as np
 
 from commonmap.config import Config
 from commonmap.errors import EmptyMapError, InputError
-from commonmap.frames import apply, from_rotation, from_xyz_yaw, invert
+from commonmap.frames import apply, from_rotation, invert
 from commonmap.mapping.ground import Ground, find_ground
 from commonmap.mapping.height_map import build_height_map, choose_cell, choose_slabs
 from commonmap.mapping.level import Levelling, find_level, no_levelling
@@ -66,17 +66,23 @@ class Prepared:
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """One map's layers for matching: height map and slabs on half the cell, and fewer points.
-
-    xyz: (M, 3) the points that may be used, one mean per voxel of a quarter cell or 0.1 m.
-    standing: (M,) bool, above the lowest slab edge. height: (M,) metres above ground.
-    """
+    """One map's layers for the search: height map and slabs on half the cell."""
 
     grid: GridMap
     slabs: SlabGrid
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Points for the refinement and the verdict, one mean per small voxel.
+
+    xyz: (M, 3) metres. height: (M,) metres above ground. standing: (M,) bool, above the lowest
+    slab edge.
+    """
+
     xyz: Float64s
-    standing: Bools
     height: Float64s
+    standing: Bools
 
 
 def match(
@@ -128,14 +134,36 @@ def match(
     # 4. z in closed form, then all six degrees of freedom on the points
     with _timed(timings, "refine"):
         progress("refine")
-        refined = _refine(base, draft, base_layers, draft_layers, found, cell)
+        draft_points = choose_points(draft, cell, edges, max_height)
+        base_points, refined = draft_points, None
+        if len(found.score):
+            T = lift(found.T_target_source(), base.ground, draft.ground)
+            around = apply(T, draft_points.xyz)
+            base_points = choose_points(base, cell, edges, max_height, around=around)
+            refined = refine(base_points.xyz, draft_points.xyz, T, cell=max(cell, found.cell))
 
     # 5. believe it or not
     with _timed(timings, "decide"):
         progress("decide")
-        figures = measure_figures(
-            base, base_layers, draft_layers, found, witness, witness_decoy, refined, cell
-        )
+        figures = Figures(*[0.0] * 14)
+        if refined is not None:
+            inliers = measure_inliers(base_points, draft_points, refined.T_target_source, cell)
+            chance = 0.0
+            if len(witness_decoy.score):
+                # How well points lie at a pose that cannot be right
+                mirrored = mirror(draft_points, witness_decoy)
+                T = lift_mirrored(witness_decoy.T_target_source(), base, mirrored)
+                around = apply(T, mirrored.xyz)
+                there = choose_points(base, cell, edges, max_height, around=around)
+                again = refine(
+                    there.xyz, mirrored.xyz, T, cell=max(cell, witness_decoy.cell), n_most=8_000,
+                    settle=False,
+                )  # fmt: skip
+                chance = measure_inliers(there, mirrored, again.T_target_source, cell)
+            figures = measure_figures(
+                base_layers, draft_layers, found, witness, witness_decoy, refined, inliers, chance,
+                cell,
+            )  # fmt: skip
         verdict = decide(figures)
         if config.decide.mode == "off":
             verdict = Verdict(True, verdict.confidence, "accepted unseen, as decide.mode is off")
@@ -194,12 +222,40 @@ def build_layers(item: Prepared, cell: float, edges: Float64s, max_height: float
         item.xyz, cell=0.5 * cell, slab_edges=edges, ground=item.ground, max_height=max_height
     )
     slabs = pack_slabs(grid.origin, grid.cell, grid["slab_occupied"], grid["slab_known"])
-    points = thin(
-        item.xyz if max_height is None else item.xyz[item.height < max_height],
-        min(0.25 * cell, 0.1),
-    )
-    height = points[:, 2] - item.ground.height_at(points[:, :2])
-    return Layers(grid, slabs, points, height > edges[0], height)
+    return Layers(grid, slabs)
+
+
+def choose_points(
+    item: Prepared, cell: float, edges: Float64s, max_height: float | None, *,
+    around: Float64s | None = None,
+) -> Points:  # fmt: skip
+    """Return the points of a prepared map below `max_height`, one mean per voxel.
+
+    The voxel is a quarter cell or 0.1 m. around: (K, 3) take only what lies within three cells of
+    the plan of these points, metres: a large base is not thinned as a whole.
+    """
+    used = np.ones(len(item.xyz), bool) if max_height is None else item.height < max_height
+    if around is not None:
+        low, high = bounds(around)
+        for a in range(2):
+            used &= item.xyz[:, a] >= low[a] - 3.0 * cell
+            used &= item.xyz[:, a] <= high[a] + 3.0 * cell
+    xyz = thin(item.xyz[used], min(0.25 * cell, 0.1))
+    height = xyz[:, 2] - item.ground.height_at(xyz[:, :2])
+    return Points(xyz, height, height > edges[0])
+
+
+def measure_inliers(base: Points, draft: Points, T_target_source: Float64s, cell: float) -> float:
+    """Return the share of the draft's standing points near standing points of the base."""
+    placed = apply(T_target_source, draft.xyz)
+    return share_of_inliers(base.xyz, base.standing, placed, draft.standing, 0.6 * cell)
+
+
+def mirror(draft: Points, decoy: Peaks) -> Points:
+    """Return the points reflected (x -> -x) about the centre of the source, as the decoy was."""
+    xyz = draft.xyz.copy()
+    xyz[:, 0] = 2.0 * decoy.centre[0] - xyz[:, 0]
+    return Points(xyz, draft.height, draft.standing)
 
 
 def least_overlap(config: Config) -> float:
@@ -234,27 +290,14 @@ def _search(
     )  # fmt: skip
 
 
-def _refine(
-    base: Prepared, draft: Prepared, base_layers: Layers, draft_layers: Layers, found: Peaks,
-    cell: float,
-) -> Refined | None:  # fmt: skip
-    """Return the refined best pose in prepared frames, or None where the search found nothing."""
-    if len(found.score) == 0:
-        return None
-    T = lift(found.T_target_source(), base.ground, draft.ground)
-    return refine(base_layers.xyz, draft_layers.xyz, T, cell=max(cell, found.cell))
-
-
 def measure_figures(
-    base: Prepared, base_layers: Layers, draft_layers: Layers, found: Peaks, witness: Peaks,
-    decoy: Peaks, refined: Refined | None, cell: float,
+    base_layers: Layers, draft_layers: Layers, found: Peaks, witness: Peaks, decoy: Peaks,
+    refined: Refined, inliers: float, decoy_inliers: float, cell: float,
 ) -> Figures:  # fmt: skip
     """Return what the verdict on the best pose of `found` rests on.
 
     witness, decoy: peaks of the evidence, of the source as it is and mirrored.
     """
-    if refined is None or len(found.score) == 0:
-        return Figures(*[0.0] * 14)
     grid = coarsen(base_layers.slabs, 2)
     columns = _about(list_columns(draft_layers.slabs), found.centre, mirrored=False)
     best_score, n_overlap = evidence_at(grid, columns, found.pose[0])
@@ -266,24 +309,6 @@ def measure_figures(
     middle = float(np.median(yaw_best))
     spread = 1.4826 * float(np.median(np.abs(yaw_best - middle)))
 
-    # How the points lie, at the best pose and at the mirrored map's
-    reach = 0.6 * cell
-    inliers = share_of_inliers(
-        base_layers.xyz, base_layers.standing,
-        apply(refined.T_target_source, draft_layers.xyz), draft_layers.standing, reach,
-    )  # fmt: skip
-    decoy_inliers = 0.0
-    if len(decoy.score):
-        flip = from_xyz_yaw(2.0 * found.centre[0], 0.0, 0.0, 0.0) @ np.diag([-1.0, 1.0, 1.0, 1.0])
-        wrong = apply(flip, draft_layers.xyz)
-        T = lift_mirrored(decoy.T_target_source(), base, wrong, draft_layers)
-        again = refine(
-            base_layers.xyz, wrong, T, cell=max(cell, decoy.cell), n_most=8_000, settle=False
-        )
-        decoy_inliers = share_of_inliers(
-            base_layers.xyz, base_layers.standing, apply(again.T_target_source, wrong),
-            draft_layers.standing, reach,
-        )  # fmt: skip
     return Figures(
         evidence=best_score,
         decoy_ratio=best_score / max(decoy_score, 1e-9),
@@ -302,14 +327,10 @@ def measure_figures(
     )
 
 
-def lift_mirrored(
-    T_planar: Float64s, base: Prepared, mirrored_xyz: Float64s, draft: Layers
-) -> Float64s:
-    """Return the planar motion of the mirrored source with z set by its lowest points."""
-    low = np.abs(draft.height) < 0.3
-    points = mirrored_xyz[low] if low.any() else mirrored_xyz
-    points = points[:: max(1, len(points) // 20_000)]
-    moved = apply(T_planar, points)
+def lift_mirrored(T_planar: Float64s, base: Prepared, mirrored: Points) -> Float64s:
+    """Return the planar motion of the mirrored source with z set by its ground."""
+    low = np.abs(mirrored.height) < 0.3
+    moved = apply(T_planar, sample(mirrored.xyz[low] if low.any() else mirrored.xyz, 20_000))
     lifted = T_planar.copy()
     lifted[2, 3] += float(np.median(base.ground.height_at(moved[:, :2]) - moved[:, 2]))
     return lifted
