@@ -207,9 +207,9 @@ def test_decide_off_accepts_whatever_there_is() -> None:
 def test_too_little_to_match_raises() -> None:
     rng = np.random.default_rng(1)
     good = pair(0)[0]
-    with pytest.raises(EmptyMapError, match="source has 99 points"):
+    with pytest.raises(EmptyMapError, match="source has 99 finite points"):
         match(good, rng.uniform(0, 10, (99, 3)))
-    with pytest.raises(EmptyMapError, match="target has 500 points over"):
+    with pytest.raises(EmptyMapError, match="target has 500 finite points over"):
         match(rng.uniform(0, 0.5, (500, 3)), good)
     with pytest.raises(EmptyMapError, match="target holds no finite point"):
         match(np.full((500, 3), np.nan), good)

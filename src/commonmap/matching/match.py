@@ -6,39 +6,44 @@ import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 import numpy as np
 
 from commonmap.config import Config
 from commonmap.errors import EmptyMapError, InputError
-from commonmap.frames import apply, from_rotation, invert
-from commonmap.mapping.ground import Ground, find_ground
-from commonmap.mapping.height_map import build_height_map, choose_cell, choose_slabs
-from commonmap.mapping.level import Levelling, find_level, no_levelling
-from commonmap.mapping.points import bounds, points_of, sample
+from commonmap.frames import apply, invert
 from commonmap.matching.decide import Figures, Verdict, decide
 from commonmap.matching.evidence import (
-    Columns,
     SlabGrid,
     coarsen,
     evidence_surface,
     list_columns,
-    pack_slabs,
     scatter,
     transform_target,
 )
-from commonmap.matching.refine import Refined, lift, refine, share_of_inliers, thin
-from commonmap.matching.search import Peaks, evidence_at, plan_search, search
+from commonmap.matching.figures import (
+    lift_mirrored,
+    measure_figures,
+    measure_inliers,
+    mirror,
+    other_poses,
+)
+from commonmap.matching.maps import (
+    Layers,
+    Prepared,
+    build_layers,
+    choose_grid,
+    choose_points,
+    prepare,
+)
+from commonmap.matching.refine import Refined, lift, refine
+from commonmap.matching.search import Peaks, centre_columns, plan_search, search
 from commonmap.matching.search_metric import search_metric
-from commonmap.matching.support import measure_support
 from commonmap.metrics.table import METRICS
 from commonmap.types import (
-    Bools,
     Candidate,
     Cloud,
     Float64s,
-    GridMap,
     Leaves,
     Match,
     Progress,
@@ -48,41 +53,6 @@ from commonmap.types import (
 
 WORKERS = 2
 """Threads; the answer does not depend on them."""
-
-
-@dataclass(frozen=True, eq=False)
-class Prepared:
-    """A map made ready: level, near its own origin, with its ground.
-
-    xyz: (N, 3) metres, in the prepared frame. T_prepared_map: (4, 4) takes the map's points there.
-    """
-
-    xyz: Float64s
-    T_prepared_map: Float64s
-    ground: Ground
-    height: Float64s
-    levelling: Levelling
-
-
-@dataclass(frozen=True, eq=False)
-class Layers:
-    """One map's layers for the search: height map and slabs on half the cell."""
-
-    grid: GridMap
-    slabs: SlabGrid
-
-
-@dataclass(frozen=True, eq=False)
-class Points:
-    """Points for the refinement and the verdict, one mean per small voxel.
-
-    xyz: (M, 3) metres. height: (M,) metres above ground. standing: (M,) bool, above the lowest
-    slab edge.
-    """
-
-    xyz: Float64s
-    height: Float64s
-    standing: Bools
 
 
 def match(
@@ -171,93 +141,6 @@ def match(
     return _answer(base, draft, found, decoy, refined, figures, verdict, config, timings, picture)
 
 
-def prepare(item: Cloud | Leaves | Float64s, name: str, config: Config) -> Prepared:
-    """Return a map with its points level and near the origin, and its ground."""
-    xyz = points_of(item, name)
-    middle = np.round(np.median(sample(xyz, 100_000), axis=0))
-    local = xyz - middle
-    low, high = bounds(local)
-    extent = (high - low)[:2]
-    if len(local) < 100 or float(extent.max()) < 1.0:
-        raise EmptyMapError(
-            f"the {name} has only {len(local)} finite points over {extent[0]:.2g} x "
-            f"{extent[1]:.2g} m; a map needs at least 100 points over a metre"
-        )
-    if float(extent.max()) > 100_000:
-        raise InputError(
-            f"the {name} spans {extent.max() / 1000:.0f} km; a map is of one place, in metres"
-        )
-    if config.level.mode == "off":
-        levelling = no_levelling("levelling was turned off")
-    elif isinstance(item, Cloud) and item.crs is not None:
-        levelling = no_levelling("a map with a coordinate reference system is level")
-    else:
-        levelling = find_level(local)
-        if levelling.tilt > 0:
-            local = apply(levelling.T_level_map, local)
-    T_prepared_map = levelling.T_level_map @ from_rotation(np.eye(3), -middle)
-    ground = find_ground(local)
-    height = local[:, 2] - ground.height_at(local[:, :2])
-    return Prepared(local, T_prepared_map, ground, height, levelling)
-
-
-def choose_grid(
-    base: Prepared, draft: Prepared, config: Config
-) -> tuple[float, Float64s, float | None]:
-    """Return (cell, slab edges, max_height) in metres, from the data where not configured.
-
-    Metrics on height maps use heights under 1 m unless told otherwise, as the source paper does.
-    """
-    cell = config.grid.resolution or choose_cell(base.xyz, draft.xyz)
-    max_height = config.grid.max_height
-    if max_height is None and METRICS[config.search.metric].layers != "slabs":
-        max_height = 1.0
-    edges = choose_slabs(draft.height, cell=cell, max_height=max_height)
-    return cell, edges, max_height
-
-
-def build_layers(item: Prepared, cell: float, edges: Float64s, max_height: float | None) -> Layers:
-    """Return the layers of a prepared map on half of `cell`."""
-    grid = build_height_map(
-        item.xyz, cell=0.5 * cell, slab_edges=edges, ground=item.ground, max_height=max_height
-    )
-    slabs = pack_slabs(grid.origin, grid.cell, grid["slab_occupied"], grid["slab_known"])
-    return Layers(grid, slabs)
-
-
-def choose_points(
-    item: Prepared, cell: float, edges: Float64s, max_height: float | None, *,
-    around: Float64s | None = None,
-) -> Points:  # fmt: skip
-    """Return the points of a prepared map below `max_height`, one mean per voxel.
-
-    The voxel is a quarter cell or 0.1 m. around: (K, 3) take only what lies within three cells of
-    the plan of these points, metres: a large base is not thinned as a whole.
-    """
-    used = np.ones(len(item.xyz), bool) if max_height is None else item.height < max_height
-    if around is not None:
-        low, high = bounds(around)
-        for a in range(2):
-            used &= item.xyz[:, a] >= low[a] - 3.0 * cell
-            used &= item.xyz[:, a] <= high[a] + 3.0 * cell
-    xyz = thin(item.xyz[used], min(0.25 * cell, 0.1))
-    height = xyz[:, 2] - item.ground.height_at(xyz[:, :2])
-    return Points(xyz, height, height > edges[0])
-
-
-def measure_inliers(base: Points, draft: Points, T_target_source: Float64s, cell: float) -> float:
-    """Return the share of the draft's standing points near standing points of the base."""
-    placed = apply(T_target_source, draft.xyz)
-    return share_of_inliers(base.xyz, base.standing, placed, draft.standing, 0.6 * cell)
-
-
-def mirror(draft: Points, decoy: Peaks) -> Points:
-    """Return the points reflected (x -> -x) about the centre of the source, as the decoy was."""
-    xyz = draft.xyz.copy()
-    xyz[:, 0] = 2.0 * decoy.centre[0] - xyz[:, 0]
-    return Points(xyz, draft.height, draft.standing)
-
-
 def least_overlap(config: Config) -> float:
     """Return the share of the source's known cells that a pose must place on known cells."""
     if config.search.min_overlap is not None:
@@ -288,65 +171,6 @@ def _search(
         floor=config.search.floor, min_overlap=least_overlap(config), mirrored=mirrored,
         workers=WORKERS, progress=tell,
     )  # fmt: skip
-
-
-def measure_figures(
-    base_layers: Layers, draft_layers: Layers, found: Peaks, witness: Peaks, decoy: Peaks,
-    refined: Refined, inliers: float, decoy_inliers: float, cell: float,
-) -> Figures:  # fmt: skip
-    """Return what the verdict on the best pose of `found` rests on.
-
-    witness, decoy: peaks of the evidence, of the source as it is and mirrored.
-    """
-    grid = coarsen(base_layers.slabs, 2)
-    columns = _about(list_columns(draft_layers.slabs), found.centre, mirrored=False)
-    best_score, n_overlap = evidence_at(grid, columns, found.pose[0])
-    elsewhere = other_poses(witness, found.pose[0], cell)
-    second_score = float(witness.score[elsewhere].max(initial=0.0))
-    decoy_score = float(decoy.score.max(initial=0.0))
-    support = measure_support(grid, columns, found.pose[0])
-    yaw_best = witness.per_yaw[:, 1][np.isfinite(witness.per_yaw[:, 1])]
-    middle = float(np.median(yaw_best))
-    spread = 1.4826 * float(np.median(np.abs(yaw_best - middle)))
-
-    return Figures(
-        evidence=best_score,
-        decoy_ratio=best_score / max(decoy_score, 1e-9),
-        second_ratio=best_score / max(second_score, 1e-9),
-        prominence=(float(yaw_best.max()) - middle) / max(spread, 1e-9),
-        support=support.share,
-        effect=support.effect,
-        support_t=support.t,
-        spread=support.spread,
-        inliers=inliers,
-        decoy_inliers=decoy_inliers,
-        overlap=float(found.overlap[0]),
-        n_overlap=float(n_overlap),
-        moved=refined.moved[0] / cell,
-        converged=float(refined.converged),
-    )
-
-
-def lift_mirrored(T_planar: Float64s, base: Prepared, mirrored: Points) -> Float64s:
-    """Return the planar motion of the mirrored source with z set by its ground."""
-    low = np.abs(mirrored.height) < 0.3
-    moved = apply(T_planar, sample(mirrored.xyz[low] if low.any() else mirrored.xyz, 20_000))
-    lifted = T_planar.copy()
-    lifted[2, 3] += float(np.median(base.ground.height_at(moved[:, :2]) - moved[:, 2]))
-    return lifted
-
-
-def other_poses(peaks: Peaks, pose: Float64s, cell: float) -> Bools:
-    """Return (M,) bool, the peaks that are another place or another heading than `pose`."""
-    delta = peaks.pose - pose
-    away = np.hypot(delta[:, 0], delta[:, 1]) > max(3.0, 5.0 * cell)
-    turned = np.abs((delta[:, 2] + np.pi) % (2.0 * np.pi) - np.pi) > math.radians(10.0)
-    return np.asarray(away | turned)
-
-
-def _about(columns: Columns, centre: Float64s, *, mirrored: bool) -> Columns:
-    xy = (columns.xy - centre) * np.array([-1.0 if mirrored else 1.0, 1.0])
-    return Columns(np.ascontiguousarray(xy), columns.occupied, columns.known, columns.n_slabs)
 
 
 def _answer(
@@ -414,7 +238,7 @@ def _draw(
         return None
     cell = plan_search(base, draft).cells[0]
     grid = coarsen(base, round(cell / base.cell))
-    columns = _about(
+    columns = centre_columns(
         list_columns(coarsen(draft, max(1, round(0.5 * cell / draft.cell)))), found.centre,
         mirrored=False,
     )  # fmt: skip

@@ -110,7 +110,7 @@ def search(
 
     # Every pose at the coarsest cell
     cell, coarse_target, columns = levels[0]
-    columns = _centred(columns, centre, mirrored)
+    columns = centre_columns(columns, centre, mirrored=mirrored)
     yaws = 2.0 * np.pi * np.arange(plan.n_yaw) / plan.n_yaw
     pose, score, per_yaw = _search_all(
         coarse_target, columns, cell, yaws, min_overlap, workers, progress
@@ -122,7 +122,7 @@ def search(
     step = 2.0 * np.pi / plan.n_yaw
     overlap = np.zeros(len(pose))
     for level, (cell, grid, fine_columns) in enumerate(levels):
-        columns = _centred(fine_columns, centre, mirrored)
+        columns = centre_columns(fine_columns, centre, mirrored=mirrored)
         yaw_step = step * cell / plan.cells[0] / 2.0
         pose, score, overlap = _climb_all(
             grid, columns, pose, 0.5 * cell, yaw_step, min_overlap, workers
@@ -170,7 +170,8 @@ def _n_yaw(radius: float, cell: float) -> int:
     return max(16, int(np.ceil(2.0 * np.pi * radius / cell)))
 
 
-def _centred(columns: Columns, centre: Float64s, mirrored: bool) -> Columns:
+def centre_columns(columns: Columns, centre: Float64s, *, mirrored: bool) -> Columns:
+    """Return the columns about a point of the source, and reflected (x -> -x) if mirrored."""
     xy = columns.xy - centre
     if mirrored:
         xy = xy * np.array([-1.0, 1.0])

@@ -1,0 +1,84 @@
+"""The figures behind a verdict: what the best pose has that chance does not reach."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from commonmap.frames import apply
+from commonmap.mapping.points import sample
+from commonmap.matching.decide import Figures
+from commonmap.matching.evidence import coarsen, list_columns
+from commonmap.matching.maps import Layers, Points, Prepared
+from commonmap.matching.refine import Refined, share_of_inliers
+from commonmap.matching.search import Peaks, centre_columns, evidence_at
+from commonmap.matching.support import measure_support
+from commonmap.types import Bools, Float64s
+
+
+def measure_figures(
+    base_layers: Layers, draft_layers: Layers, found: Peaks, witness: Peaks, decoy: Peaks,
+    refined: Refined, inliers: float, decoy_inliers: float, cell: float,
+) -> Figures:  # fmt: skip
+    """Return what the verdict on the best pose of `found` rests on.
+
+    witness, decoy: peaks of the evidence, of the source as it is and mirrored.
+    """
+    grid = coarsen(base_layers.slabs, 2)
+    columns = centre_columns(list_columns(draft_layers.slabs), found.centre, mirrored=False)
+    best_score, n_overlap = evidence_at(grid, columns, found.pose[0])
+    elsewhere = other_poses(witness, found.pose[0], cell)
+    second_score = float(witness.score[elsewhere].max(initial=0.0))
+    decoy_score = float(decoy.score.max(initial=0.0))
+    support = measure_support(grid, columns, found.pose[0])
+    yaw_best = witness.per_yaw[:, 1][np.isfinite(witness.per_yaw[:, 1])]
+    middle = float(np.median(yaw_best))
+    spread = 1.4826 * float(np.median(np.abs(yaw_best - middle)))
+
+    return Figures(
+        evidence=best_score,
+        decoy_ratio=best_score / max(decoy_score, 1e-9),
+        second_ratio=best_score / max(second_score, 1e-9),
+        prominence=(float(yaw_best.max()) - middle) / max(spread, 1e-9),
+        support=support.share,
+        effect=support.effect,
+        support_t=support.t,
+        spread=support.spread,
+        inliers=inliers,
+        decoy_inliers=decoy_inliers,
+        overlap=float(found.overlap[0]),
+        n_overlap=float(n_overlap),
+        moved=refined.moved[0] / cell,
+        converged=float(refined.converged),
+    )
+
+
+def lift_mirrored(T_planar: Float64s, base: Prepared, mirrored: Points) -> Float64s:
+    """Return the planar motion of the mirrored source with z set by its ground."""
+    low = np.abs(mirrored.height) < 0.3
+    moved = apply(T_planar, sample(mirrored.xyz[low] if low.any() else mirrored.xyz, 20_000))
+    lifted = T_planar.copy()
+    lifted[2, 3] += float(np.median(base.ground.height_at(moved[:, :2]) - moved[:, 2]))
+    return lifted
+
+
+def other_poses(peaks: Peaks, pose: Float64s, cell: float) -> Bools:
+    """Return (M,) bool, the peaks that are another place or another heading than `pose`."""
+    delta = peaks.pose - pose
+    away = np.hypot(delta[:, 0], delta[:, 1]) > max(3.0, 5.0 * cell)
+    turned = np.abs((delta[:, 2] + np.pi) % (2.0 * np.pi) - np.pi) > math.radians(10.0)
+    return np.asarray(away | turned)
+
+
+def measure_inliers(base: Points, draft: Points, T_target_source: Float64s, cell: float) -> float:
+    """Return the share of the draft's standing points near standing points of the base."""
+    placed = apply(T_target_source, draft.xyz)
+    return share_of_inliers(base.xyz, base.standing, placed, draft.standing, 0.6 * cell)
+
+
+def mirror(draft: Points, decoy: Peaks) -> Points:
+    """Return the points reflected (x -> -x) about the centre of the source, as the decoy was."""
+    xyz = draft.xyz.copy()
+    xyz[:, 0] = 2.0 * decoy.centre[0] - xyz[:, 0]
+    return Points(xyz, draft.height, draft.standing)

@@ -1,0 +1,128 @@
+"""Maps made ready for matching: level, near their own origin, cut into layers, thinned."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from commonmap.config import Config
+from commonmap.errors import EmptyMapError, InputError
+from commonmap.frames import apply, from_rotation
+from commonmap.mapping.ground import Ground, find_ground
+from commonmap.mapping.height_map import build_height_map, choose_cell, choose_slabs
+from commonmap.mapping.level import Levelling, find_level, no_levelling
+from commonmap.mapping.points import bounds, points_of, sample
+from commonmap.matching.evidence import SlabGrid, pack_slabs
+from commonmap.matching.refine import thin
+from commonmap.metrics.table import METRICS
+from commonmap.types import Bools, Cloud, Float64s, GridMap, Leaves
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A map made ready: level, near its own origin, with its ground.
+
+    xyz: (N, 3) metres, in the prepared frame. T_prepared_map: (4, 4) takes the map's points there.
+    """
+
+    xyz: Float64s
+    T_prepared_map: Float64s
+    ground: Ground
+    height: Float64s
+    levelling: Levelling
+
+
+@dataclass(frozen=True, eq=False)
+class Layers:
+    """One map's layers for the search: height map and slabs on half the cell."""
+
+    grid: GridMap
+    slabs: SlabGrid
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Points for the refinement and the verdict, one mean per small voxel.
+
+    xyz: (M, 3) metres. height: (M,) metres above ground. standing: (M,) bool, above the lowest
+    slab edge.
+    """
+
+    xyz: Float64s
+    height: Float64s
+    standing: Bools
+
+
+def prepare(item: Cloud | Leaves | Float64s, name: str, config: Config) -> Prepared:
+    """Return a map with its points level and near the origin, and its ground."""
+    xyz = points_of(item, name)
+    middle = np.round(np.median(sample(xyz, 100_000), axis=0))
+    local = xyz - middle
+    low, high = bounds(local)
+    extent = (high - low)[:2]
+    if len(local) < 100 or float(extent.max()) < 1.0:
+        raise EmptyMapError(
+            f"the {name} has {len(local)} finite points over {extent[0]:.2g} x "
+            f"{extent[1]:.2g} m; a map needs at least 100 points over a metre"
+        )
+    if float(extent.max()) > 100_000:
+        raise InputError(
+            f"the {name} spans {extent.max() / 1000:.0f} km; a map is of one place, in metres"
+        )
+    if config.level.mode == "off":
+        levelling = no_levelling("levelling was turned off")
+    elif isinstance(item, Cloud) and item.crs is not None:
+        levelling = no_levelling("a map with a coordinate reference system is level")
+    else:
+        levelling = find_level(local)
+        if levelling.tilt > 0:
+            local = apply(levelling.T_level_map, local)
+    T_prepared_map = levelling.T_level_map @ from_rotation(np.eye(3), -middle)
+    ground = find_ground(local)
+    height = local[:, 2] - ground.height_at(local[:, :2])
+    return Prepared(local, T_prepared_map, ground, height, levelling)
+
+
+def choose_grid(
+    base: Prepared, draft: Prepared, config: Config
+) -> tuple[float, Float64s, float | None]:
+    """Return (cell, slab edges, max_height) in metres, from the data where not configured.
+
+    Metrics on height maps use heights under 1 m unless told otherwise, as the source paper does.
+    """
+    cell = config.grid.resolution or choose_cell(base.xyz, draft.xyz)
+    max_height = config.grid.max_height
+    if max_height is None and METRICS[config.search.metric].layers != "slabs":
+        max_height = 1.0
+    edges = choose_slabs(draft.height, cell=cell, max_height=max_height)
+    return cell, edges, max_height
+
+
+def build_layers(item: Prepared, cell: float, edges: Float64s, max_height: float | None) -> Layers:
+    """Return the layers of a prepared map on half of `cell`."""
+    grid = build_height_map(
+        item.xyz, cell=0.5 * cell, slab_edges=edges, ground=item.ground, max_height=max_height
+    )
+    slabs = pack_slabs(grid.origin, grid.cell, grid["slab_occupied"], grid["slab_known"])
+    return Layers(grid, slabs)
+
+
+def choose_points(
+    item: Prepared, cell: float, edges: Float64s, max_height: float | None, *,
+    around: Float64s | None = None,
+) -> Points:  # fmt: skip
+    """Return the points of a prepared map below `max_height`, one mean per voxel.
+
+    The voxel is a quarter cell or 0.1 m. around: (K, 3) take only what lies within three cells of
+    the plan of these points, metres: a large base is not thinned as a whole.
+    """
+    used = np.ones(len(item.xyz), bool) if max_height is None else item.height < max_height
+    if around is not None:
+        low, high = bounds(around)
+        for a in range(2):
+            used &= item.xyz[:, a] >= low[a] - 3.0 * cell
+            used &= item.xyz[:, a] <= high[a] + 3.0 * cell
+    xyz = thin(item.xyz[used], min(0.25 * cell, 0.1))
+    height = xyz[:, 2] - item.ground.height_at(xyz[:, :2])
+    return Points(xyz, height, height > edges[0])
