@@ -19,6 +19,7 @@ from commonmap.odometry.geometry import (
     find_lack,
 )
 from commonmap.odometry.local_map import LocalMap, thin
+from commonmap.odometry.map_match import match_planes
 from commonmap.odometry.motion import (
     T_to_motion,
     damp_rate,
@@ -420,3 +421,19 @@ def test_rings_are_derived_from_points_in_the_order_of_rings() -> None:
 def test_inverse_of_a_motion_is_that_of_its_matrix() -> None:
     T = from_rotation(Rotation.from_euler("xyz", [0.1, 0.2, 0.3]).as_matrix(), [1, 2, 3])
     assert pytest.approx(np.eye(4), abs=1e-9) == motion_to_T(T_to_motion(invert(T))) @ T
+
+
+def test_one_ring_with_noisy_ranges_is_no_plane() -> None:
+    """A ring and the beam span a false plane, which would hold a moving sensor back."""
+    rng = np.random.default_rng(8)
+    y = np.linspace(-0.5, 0.5, 200)
+    ring = np.stack([5.0 + 0.03 * rng.standard_normal(200), y, 0 * y], axis=1)  # on the wall x = 5
+    fine, coarse = (LocalMap(v, per_voxel=50, reach=50.0) for v in (0.3, 0.9))
+    fine.insert(ring)
+    coarse.insert(ring)
+    assert len(match_planes(ring[::10].copy(), np.eye(4), fine, coarse)) == 0
+    for z in (-0.25, -0.15, 0.15, 0.25):
+        fine.insert(ring + [0.0, 0.0, z])
+    rows = match_planes(ring[40:160:10].copy(), np.eye(4), fine, coarse)
+    assert len(rows) == 12
+    assert np.abs(rows.u[:, 0]).min() > 0.95

@@ -42,7 +42,7 @@ FALL = 0.5
 class LoamOptions:
     """Settings of `Loam`. Lengths that are None follow from the first turn.
 
-    voxel: metres, edge of the fine map's voxels; the median range / 45 (0.2 to 1 m) unless given.
+    voxel: metres, edge of the fine map's voxels; the median range / 45 (0.3 to 1 m) unless given.
     coarse: the coarse map's voxels, in fine ones.
     n_planar: planar points a turn to register to the map, about.
     scan_rounds, map_rounds: how often partners are looked for, at most.
@@ -129,7 +129,7 @@ class Loam:
         """Derive the lengths from the first turn and make the maps."""
         o = self.options
         median = float(np.median(turn.range)) if len(turn.range) else 10.0
-        self.voxel = float(np.clip(median / 45.0, 0.2, 1.0)) if o.voxel is None else o.voxel
+        self.voxel = float(np.clip(median / 45.0, 0.3, 1.0)) if o.voxel is None else o.voxel
         self.lever = median
         reach = float(np.clip(1.2 * turn.range.max(initial=10.0), 10.0, 250.0))
         self.fine = LocalMap(self.voxel, per_voxel=o.per_voxel, reach=reach)

@@ -13,6 +13,10 @@ from commonmap.types import Float64s
 LEAST_SIGMA = 0.01
 """Metres; no surface is trusted more than this."""
 
+WIDTH = 0.28
+"""A plane's points spread at least so much of a voxel across their longest direction, standard
+deviation (a disc of one voxel's radius: 0.5)."""
+
 
 def match_planes(points: Float64s, T: Float64s, fine: LocalMap, coarse: LocalMap) -> Rows:
     """Return one row (Eq. 3) for each planar point (N, 3) that finds a plane in the map.
@@ -107,8 +111,10 @@ def _planes(  # type: ignore[no-untyped-def]
                 continue
             eigen3(S, lam, V)
             low = max(lam[0], 0.0) * m / (m - 3.0)
-            # a plane: wide both ways, and thin
-            if lam[1] > 0.05 * lam[2] and lam[1] > 5.0 * low:
+            # a plane: wide both ways, and thin; one ring with the noise of its ranges is a
+            # false plane, spanned by the ring and the beam, that would hold the sensor back
+            wide = WIDTH * (edge if level == 0 else edge2)
+            if lam[1] > wide * wide and lam[1] > 0.05 * lam[2] and lam[1] > 5.0 * low:
                 found = True
                 break
         if not found:
