@@ -433,7 +433,7 @@ def test_one_ring_with_noisy_ranges_is_no_plane() -> None:
     coarse.insert(ring)
     assert len(match_planes(ring[::10].copy(), np.eye(4), fine, coarse)) == 0
     for z in (-0.25, -0.15, 0.15, 0.25):
-        fine.insert(ring + [0.0, 0.0, z])
+        fine.insert(ring + np.array([0.0, 0.0, z]))
     rows = match_planes(ring[40:160:10].copy(), np.eye(4), fine, coarse)
     assert len(rows) == 12
     assert np.abs(rows.u[:, 0]).min() > 0.95

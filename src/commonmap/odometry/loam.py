@@ -242,7 +242,9 @@ class Loam:
         self._deskew_rate_last = sweep_motion(T_to_motion(invert(T) @ self.poses[-1]), dt)[0]
         n_matched = int((w > 0).sum())
         share = min(n_matched / max(looked, 1), 1.0)
-        lost = n_matched < LEAST_MATCHED or share < max(LEAST_SHARE, FALL * self._share)
+        # a map of two or three turns is thin: that few features find a plane there is no trouble
+        usual = max(LEAST_SHARE, FALL * self._share) if len(self.poses) >= 5 else 0.0
+        lost = n_matched < LEAST_MATCHED or share < usual
         if not lost:
             self._share += 0.1 * (share - self._share) if self._share else share
         R = T[:3, :3]
