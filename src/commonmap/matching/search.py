@@ -76,7 +76,7 @@ def plan_search(target: SlabGrid, source: SlabGrid, *, budget: float = 1e8) -> S
     cell = 2.0 * target.cell
     cells = [cell]
     while True:
-        n_yaw = _n_yaw(radius, cells[0])
+        n_yaw = count_yaws(radius, cells[0])
         side = [n * target.cell / cells[0] + 2.0 * radius / cells[0] for n in target.shape]
         cost = side[0] * side[1] * n_yaw * (4 * target.n_slabs)
         if cost <= budget or 2.0 * radius / (2.0 * cells[0]) < 16:
@@ -165,7 +165,7 @@ def _radius(columns: Columns) -> float:
     return float(np.quantile(distance, 0.98))
 
 
-def _n_yaw(radius: float, cell: float) -> int:
+def count_yaws(radius: float, cell: float) -> int:
     """Return how many yaws: the outermost columns move by one cell between two of them."""
     return max(16, int(np.ceil(2.0 * np.pi * radius / cell)))
 

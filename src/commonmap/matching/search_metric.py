@@ -13,7 +13,7 @@ import numba
 import numpy as np
 
 from commonmap.matching import correlate
-from commonmap.matching.search import Peaks, local_maxima, separate
+from commonmap.matching.search import Peaks, count_yaws, local_maxima, separate
 from commonmap.metrics.plans import DifferenceSum, JointHistogram, MinSum, Smooth
 from commonmap.metrics.table import find_metric
 from commonmap.types import Float64s, GridMap, Progress, no_progress
@@ -52,7 +52,7 @@ def search_metric(
     factor = 2
     while True:
         cell = factor * target.cell
-        n_yaw = max(16, int(np.ceil(2.0 * np.pi * radius / cell)))
+        n_yaw = count_yaws(radius, cell)
         sides = [n * target.cell / cell + 2.0 * reach / cell for n in target.shape]
         if sides[0] * sides[1] * n_yaw <= budget or 2.0 * radius / (2.0 * cell) < 16:
             break
