@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from commonmap.matching.correlate import PreparedTarget
 
 WIDEN = 0.25
-"""The range of ln(A / B) over the poses is widened to multiples of this: few kernels to prepare."""
+"""The range of ln(A / B) over the poses is widened to plus and minus a multiple of this: few
+kernels to prepare."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +125,8 @@ def _kernels(
         ranges = [
             ratio_range(arrays, some.values["a"], some.values["b"], some.counted) for some in poses
         ]
-        span = _span(ranges, WIDEN)
+        largest = max(abs(g) for some in ranges for g in some)
+        span = _span([(-largest, largest)], WIDEN)
     elif reading == "map":
         ratios = [float(np.log(some.total_s / some.total_t)) for some in poses]
         span = _span([(g, g) for g in ratios], WIDEN)
