@@ -231,7 +231,7 @@ def test_progress_names_the_steps() -> None:
     told: list[str] = []
     match(*pair(6), progress=lambda step, share=0.0: told.append(step))
     steps = list(dict.fromkeys(told))
-    assert steps[0] == "prepare the target"
+    assert steps[0] == "prepare the maps"
     assert {"search", "search the mirrored map", "refine", "decide"} <= set(steps)
 
 

@@ -10,8 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from commonmap.frames import from_xyz_yaw
 from commonmap.mapping.ground import Ground
-from commonmap.matching.refine import lift, refine, share_of_inliers, thin
+from commonmap.mapping.points import thin
+from commonmap.matching.inliers import share_of_inliers
+from commonmap.matching.refine import lift, refine
 from commonmap.types import Float64s
 from matching_scenes import apart, look, make_place, moved, rigid
 
@@ -242,7 +245,14 @@ def test_inliers_by_hand() -> None:
     target = np.concatenate([floor, post])
     stands = target[:, 2] > 0.25
     source = np.concatenate([post, post + np.array([5.0, 0, 0]), post + np.array([900.0, 0, 0])])
-    share = share_of_inliers(target, stands, source, source[:, 2] > 0.25, 0.5)
+    still = np.eye(4)
+    share = share_of_inliers(target, stands, source, source[:, 2] > 0.25, still, reach=0.5)
     assert share == pytest.approx(0.5)  # the one at 900 m lies over nothing known
-    assert share_of_inliers(target, stands, source, np.zeros(len(source), bool), 0.5) == 0.0
-    assert share_of_inliers(target, np.zeros(len(target), bool), source, source[:, 2] > 0, 1) == 0.0
+    none = np.zeros(len(source), bool)
+    assert share_of_inliers(target, stands, source, none, still, reach=0.5) == 0.0
+    none = np.zeros(len(target), bool)
+    assert share_of_inliers(target, none, source, source[:, 2] > 0, still, reach=1.0) == 0.0
+    away = from_xyz_yaw(500.0, 0.0, 0.0, 0.0)
+    assert share_of_inliers(target, stands, source, source[:, 2] > 0.25, away, reach=0.5) == 0.0
+    half = from_xyz_yaw(-5.0, 0.0, 0.3, 0.0)  # the other post now, and a little higher
+    assert share_of_inliers(target, stands, source, source[:, 2] > 0.25, half, reach=0.5) == 0.5

@@ -52,7 +52,9 @@ def invert(T_a_b: Float64s) -> Float64s:
 
 def apply(T_a_b: Float64s, points_b: NDArray[Any]) -> Float64s:
     """Return the (N, 3) points of frame b in frame a."""
-    return np.asarray(points_b, dtype=np.float64) @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+    points_a = np.asarray(points_b, dtype=np.float64) @ T_a_b[:3, :3].T
+    points_a += T_a_b[:3, 3]
+    return np.asarray(points_a)
 
 
 def from_xyz_yaw(x: float, y: float, z: float, yaw: float) -> Float64s:

@@ -96,7 +96,7 @@ def typical_spacing(xyz: Float64s) -> float:
     return float(coarse / math.sqrt(max(median, 1.0)))
 
 
-@numba.njit(cache=True)  # type: ignore[misc]
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
 def _count(xyz, low, cell, n_x, n_y):  # type: ignore[no-untyped-def]
     count = np.zeros(n_x * n_y, np.int32)
     for n in range(xyz.shape[0]):
@@ -161,7 +161,7 @@ def _double(a: Float64s, shape: tuple[int, ...]) -> Float64s:
     return a
 
 
-@numba.njit(cache=True)  # type: ignore[misc]
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
 def _lowest(xyz, origin, cell, nx, ny):  # type: ignore[no-untyped-def]
     z = np.full((nx, ny), np.nan)
     for n in range(xyz.shape[0]):
@@ -181,7 +181,7 @@ def _drop_low_blunders(lowest: Float64s, cell: float) -> Float64s:
     return np.where(blunder, np.nan, lowest)
 
 
-@numba.njit(cache=True)  # type: ignore[misc]
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
 def _cone_envelope(lowest, rise):  # type: ignore[no-untyped-def]
     """Return min over cells q of lowest[q] + rise * distance(p, q), by a two-pass chamfer."""
     nx, ny = lowest.shape
@@ -244,7 +244,7 @@ def _drop_standing_pieces(z: Float64s, candidate: Bools, cell: float, step: floa
     return kept if kept.any() else candidate
 
 
-@numba.njit(cache=True)  # type: ignore[misc]
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
 def _label_smooth(z, step):  # type: ignore[no-untyped-def]
     nx, ny = z.shape
     label = np.zeros((nx, ny), np.int32)
@@ -273,7 +273,7 @@ def _label_smooth(z, step):  # type: ignore[no-untyped-def]
     return label
 
 
-@numba.njit(cache=True)  # type: ignore[misc]
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
 def _compare_borders(z, label, n_pieces, reach, margin, rise):  # type: ignore[no-untyped-def]
     """Count, per piece, looks along x and y that meet another piece clearly lower, or not lower."""
     lower = np.zeros(n_pieces + 1, np.int64)
@@ -303,7 +303,7 @@ def _compare_borders(z, label, n_pieces, reach, margin, rise):  # type: ignore[n
     return lower, higher
 
 
-@numba.njit(cache=True)  # type: ignore[misc]
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
 def _bilinear(z, origin, cell, xy):  # type: ignore[no-untyped-def]
     nx, ny = z.shape
     out = np.empty(xy.shape[0])

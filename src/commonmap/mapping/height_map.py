@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from commonmap.errors import EmptyMapError, InputError
 from commonmap.mapping.ground import Ground, find_ground, typical_spacing
-from commonmap.mapping.points import bounds, sample
+from commonmap.mapping.points import sample
 from commonmap.types import Float64s, GridMap
 
 NICE_CELLS = (0.05, 0.1, 0.2, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
@@ -78,12 +78,14 @@ def build_height_map(
     slab_edges: Float64s,
     ground: Ground | None = None,
     max_height: float | None = None,
+    height: Float64s | None = None,
 ) -> GridMap:
     """Return the height map of an (N, 3) cloud that is level, with layers named above.
 
     cell: metres. slab_edges: (K+1,) rising heights above ground, at most 32 slabs.
     ground: by default found from the cloud. max_height: use only what is less than this above
     ground (1 m is the paper's set-up). Points more than 1 m under the ground are left out.
+    height: (N,) of the points above that ground, where the caller has it already.
     Raises EmptyMapError when nothing is left.
     """
     if not (np.isfinite(cell) and cell > 0):
@@ -93,20 +95,19 @@ def build_height_map(
     if len(slab_edges) < 2 or len(slab_edges) > 33 or not np.all(np.diff(slab_edges) > 0):
         raise InputError("slab_edges must be 2 to 33 rising heights in metres")
     ground = ground or find_ground(xyz)
-    height = xyz[:, 2] - ground.height_at(xyz[:, :2])
+    if height is None:
+        height = xyz[:, 2] - ground.height_at(xyz[:, :2])
     limit = np.inf if max_height is None else max_height
-    used = (height > -1.0) & (height < limit)
-    if not used.any():
+    found = _find_columns(np.ascontiguousarray(xyz), height, limit, cell)
+    if found is None:
         raise EmptyMapError(
             f"no point lies between 1 m below the ground and {limit:g} m above it; nothing to match"
         )
-    points, height = np.ascontiguousarray(xyz[used]), height[used]
-    low, high = bounds(points)
-    origin = np.floor(low[:2] / cell) * cell
-    n_x, n_y = np.floor((high[:2] - origin) / cell).astype(int) + 1
+    origin, (n_x, n_y) = found
     count, top, lowest, highest, bits = _fill_columns(
-        points, height, origin, cell, int(n_x), int(n_y), np.asarray(slab_edges, np.float64)
-    )
+        np.ascontiguousarray(xyz), height, limit, origin, cell, n_x, n_y,
+        np.asarray(slab_edges, np.float64),
+    )  # fmt: skip
     known = count > 0
     slabs = np.arange(len(slab_edges) - 1, dtype=np.uint32)[:, None, None]
     occupied = ((bits >> slabs) & 1).astype(bool)
@@ -125,14 +126,39 @@ def build_height_map(
     return GridMap(origin=origin, cell=cell, layers=layers, slab_edges=np.asarray(slab_edges))
 
 
-@numba.njit(cache=True)  # type: ignore[misc]
-def _fill_columns(xyz, height, origin, cell, n_x, n_y, edges):  # type: ignore[no-untyped-def]
+def _find_columns(
+    xyz: Float64s, height: Float64s, limit: float, cell: float
+) -> tuple[Float64s, tuple[int, int]] | None:
+    """Return the grid's origin (2,) and shape over the used points, None where none is."""
+    low, high = _used_bounds(xyz, height, limit)
+    if not np.isfinite(low).all():
+        return None
+    origin = np.floor(low / cell) * cell
+    n_x, n_y = np.floor((high - origin) / cell).astype(int) + 1
+    return origin, (int(n_x), int(n_y))
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _used_bounds(xyz, height, limit):  # type: ignore[no-untyped-def]
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for n in range(xyz.shape[0]):
+        if -1.0 < height[n] < limit:
+            for a in range(2):
+                low[a] = min(low[a], xyz[n, a])
+                high[a] = max(high[a], xyz[n, a])
+    return low, high
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _fill_columns(xyz, height, limit, origin, cell, n_x, n_y, edges):  # type: ignore[no-untyped-def]
     count = np.zeros((n_x, n_y), np.int32)
     top = np.full((n_x, n_y), np.nan)
     lowest = np.full((n_x, n_y), np.nan)
     highest = np.full((n_x, n_y), np.nan)
     bits = np.zeros((n_x, n_y), np.uint32)
     for n in range(xyz.shape[0]):
+        if not -1.0 < height[n] < limit:
+            continue
         i = min(int((xyz[n, 0] - origin[0]) / cell), n_x - 1)
         j = min(int((xyz[n, 1] - origin[1]) / cell), n_y - 1)
         count[i, j] += 1

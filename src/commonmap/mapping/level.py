@@ -166,15 +166,23 @@ def _scatter_of_parts(xyz: Float64s, a: float, b: float) -> float:
     return 1.5 * float(np.linalg.norm(np.maximum(spread, 1e-3)) / math.sqrt(len(found)))
 
 
-@numba.njit(cache=True)  # type: ignore[misc]
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
 def _shared_pairs(xyz, a, b, cell):  # type: ignore[no-untyped-def]
     """Return how many pairs of points share a plan cell, seen along the direction (a, b, 1).
 
     Counted on two grids half a cell apart: a wall on a border of one is within a cell of the other.
     """
-    n = 1024
-    pairs = 0.0
     tan_a, tan_b = np.tan(a), np.tan(b)
+    low_x = low_y = np.inf
+    high_x = high_y = -np.inf
+    for k in range(xyz.shape[0]):
+        x, y = xyz[k, 0] - tan_a * xyz[k, 2], xyz[k, 1] - tan_b * xyz[k, 2]
+        low_x, high_x = min(low_x, x), max(high_x, x)
+        low_y, high_y = min(low_y, y), max(high_y, y)
+    n = 64  # cells along a side; what lies further apart is folded onto it
+    while n < 1024 and n * cell < max(high_x - low_x, high_y - low_y) + 2.0 * cell:
+        n *= 2
+    pairs = 0.0
     for shift in (0.0, 0.5):
         count = np.zeros((n, n), np.int32)
         for k in range(xyz.shape[0]):
@@ -216,7 +224,7 @@ def _directions(n: int) -> Float64s:
     return np.column_stack([r * np.cos(turn), r * np.sin(turn), z])
 
 
-@numba.njit(cache=True)  # type: ignore[misc]
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
 def _smooth_share(xyz, R, size):  # type: ignore[no-untyped-def]
     """Return the share of columns whose lowest point goes on straight from neighbour to neighbour.
 

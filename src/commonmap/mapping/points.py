@@ -8,7 +8,9 @@ from numpy.typing import NDArray
 
 from commonmap.errors import EmptyMapError
 from commonmap.frames import check_points
-from commonmap.types import TREE_DEPTH, Cloud, Float64s, Leaves
+from commonmap.types import TREE_DEPTH, Bools, Cloud, Float64s, Leaves
+
+GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
 MAX_VOXELS = 20_000_000
 """Pruned leaves are opened up to about this many voxels; beyond, each stands for itself."""
@@ -59,12 +61,78 @@ def bounds(xyz: Float64s) -> tuple[Float64s, Float64s]:
     return low, high
 
 
+def inside_box(points: Float64s, low: Float64s, high: Float64s) -> Bools:
+    """Return (N,) bool, which of (N, D) points lie in a box, low and high of D or fewer numbers."""
+    inside = np.ones(len(points), dtype=bool)
+    for a in range(len(low)):  # coordinate by coordinate: a third of the time
+        inside &= (points[:, a] >= low[a]) & (points[:, a] <= high[a])
+    return inside
+
+
 def sample(xyz: Float64s, n_most: int) -> Float64s:
-    """Return every k-th point, k the smallest that leaves at most `n_most`."""
-    return xyz[:: max(1, -(-len(xyz) // n_most))]
+    """Return at most `n_most` of the points, one from each of as many equal runs of them.
+
+    Where in its run a point is taken from follows the golden ratio: an even step would meet the
+    same rings of a spinning lidar over and over.
+    """
+    return xyz if len(xyz) <= n_most else xyz[_sampled(len(xyz), n_most)]
 
 
-@numba.njit(cache=True)  # type: ignore[misc]
+def _sampled(n: int, n_most: int) -> NDArray[np.int64]:
+    run = np.arange(n_most, dtype=np.float64)
+    return ((run + (run * GOLDEN) % 1.0) * (n / n_most)).astype(np.int64)
+
+
+def thin(xyz: Float64s, voxel: float, n_most: int | None = None) -> Float64s:
+    """Return the mean point of every voxel of a width in metres, in the order of the voxels.
+
+    n_most: widen the voxels until about so many are left; the means of smaller voxels then count
+    one each, however many points they hold.
+    """
+    for _ in range(8):
+        if len(xyz) == 0:
+            return xyz
+        order, starts = _group(xyz, voxel)
+        xyz = np.asarray(_means(np.ascontiguousarray(xyz), order, starts))
+        if n_most is None or len(xyz) <= n_most:
+            break
+        voxel *= max(1.15, np.sqrt(len(xyz) / n_most) * 0.95)
+    return xyz
+
+
+def _group(xyz: Float64s, voxel: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the points' order by voxel, and where each voxel starts in it."""
+    key = _voxel_keys(np.ascontiguousarray(xyz), 1.0 / voxel)
+    order = np.argsort(key, kind="stable")
+    edges = np.nonzero(np.diff(key[order]))[0] + 1
+    return order, np.concatenate([[0], edges, [len(key)]]).astype(np.int64)
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _voxel_keys(xyz, scale):  # type: ignore[no-untyped-def]
+    """Return one int64 per point, 21 bits an axis: equal for the points of one voxel."""
+    key = np.empty(xyz.shape[0], np.int64)
+    for n in range(xyz.shape[0]):
+        i = int(np.floor(xyz[n, 0] * scale)) & 0x1FFFFF
+        j = int(np.floor(xyz[n, 1] * scale)) & 0x1FFFFF
+        k = int(np.floor(xyz[n, 2] * scale)) & 0x1FFFFF
+        key[n] = (i << 42) | (j << 21) | k
+    return key
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _means(xyz, order, starts):  # type: ignore[no-untyped-def]
+    out = np.zeros((starts.shape[0] - 1, 3))
+    for v in range(starts.shape[0] - 1):
+        for n in range(starts[v], starts[v + 1]):
+            for a in range(3):
+                out[v, a] += xyz[order[n], a]
+        for a in range(3):
+            out[v, a] /= starts[v + 1] - starts[v]
+    return out
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
 def _bounds(xyz: NDArray[np.float64]):  # type: ignore[no-untyped-def]
     low, high = xyz[0].copy(), xyz[0].copy()
     for n in range(xyz.shape[0]):

@@ -7,6 +7,8 @@ translations of one yaw come exactly from cross-correlations of the binary layer
 
     n = known_s * known_t    n_1 = occupied_s * known_t    n_2 = known_s * occupied_t
     n11 = occupied_s * occupied_t
+
+The transforms run on NumPy or, where the target was transformed on it, on CuPy.
 """
 
 from __future__ import annotations
@@ -19,9 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from commonmap.matching.arrays import NUMPY, Array, Arrays, borrow, invert, transform
 from commonmap.types import Bools, Float32s, Float64s
 
-Bits = NDArray[np.uint32]
+Bits = NDArray[np.unsignedinteger[Any]]
+Range = tuple[int, int]
+"""From the first to behind the last."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +34,8 @@ class SlabGrid:
     """Occupied and known height slabs per cell, one bit a slab (bit k is slab k, at most 32).
 
     origin: (2,) metres, the lower corner of cell [0, 0]. cell: metres.
-    occupied, known: (nx, ny) uint32; an occupied slab is known.
+    occupied, known: (nx, ny) uint32, or a narrower unsigned type that holds the slabs, also mapped
+    from a file; an occupied slab is known.
     """
 
     origin: Float64s
@@ -47,9 +53,12 @@ class SlabGrid:
 def pack_slabs(origin: Float64s, cell: float, occupied: Bools, known: Bools) -> SlabGrid:
     """Return the (n_slabs, nx, ny) bool layers packed one bit a slab."""
     n_slabs = occupied.shape[0]
-    weight = (np.uint32(1) << np.arange(n_slabs, dtype=np.uint32))[:, None, None]
-    bits_known = np.bitwise_or.reduce(np.where(known | occupied, weight, np.uint32(0)), axis=0)
-    bits_occupied = np.bitwise_or.reduce(np.where(occupied, weight, np.uint32(0)), axis=0)
+    bits_occupied = np.zeros(occupied.shape[1:], np.uint32)
+    bits_known = np.zeros(occupied.shape[1:], np.uint32)
+    for k in range(n_slabs):
+        bits_occupied |= occupied[k].astype(np.uint32) << np.uint32(k)
+        bits_known |= known[k].astype(np.uint32) << np.uint32(k)
+    bits_known |= bits_occupied
     return SlabGrid(np.asarray(origin, float), cell, bits_occupied, bits_known, n_slabs)
 
 
@@ -60,19 +69,66 @@ def coarsen(grid: SlabGrid, factor: int) -> SlabGrid:
     """
     if factor == 1:
         return grid
-    start = np.round(grid.origin / grid.cell).astype(np.int64)
-    before = start % factor
-    pad = [(int(b), int(-(b + n) % factor)) for b, n in zip(before, grid.shape, strict=True)]
+    n_x, n_y = coarse_shape(grid, factor)
+    return coarse_window(grid, factor, (0, n_x), (0, n_y))
 
-    def reduce(bits: Bits) -> Bits:
-        full = np.pad(bits, pad)
-        blocks = full.reshape(full.shape[0] // factor, factor, full.shape[1] // factor, factor)
-        return np.asarray(np.bitwise_or.reduce(np.bitwise_or.reduce(blocks, axis=3), axis=1))
 
-    origin = (start - before).astype(np.float64) * grid.cell
-    return SlabGrid(
-        origin, grid.cell * factor, reduce(grid.occupied), reduce(grid.known), grid.n_slabs
+def coarse_window(grid: SlabGrid, factor: int, rows: Range, columns: Range) -> SlabGrid:
+    """Return these cells of the coarse grid, uint32; what lies outside the grid is unknown.
+
+    Only the part of `grid` below the window is read.
+    """
+    before = _cells_before(grid, factor)
+    # rows and columns of `grid` that lie in the window
+    (i0, i1), (j0, j1) = (
+        (max(low * factor - skip, 0), min(high * factor - skip, n))
+        for (low, high), skip, n in zip((rows, columns), before, grid.shape, strict=True)
     )
+    first = (i0 + before[0] - rows[0] * factor, j0 + before[1] - columns[0] * factor)
+    shape = (rows[1] - rows[0], columns[1] - columns[0])
+    occupied, known = np.zeros(shape, np.uint32), np.zeros(shape, np.uint32)
+    if i1 > i0 and j1 > j0:
+        _join(np.asarray(grid.occupied[i0:i1, j0:j1]), factor, *first, occupied)
+        _join(np.asarray(grid.known[i0:i1, j0:j1]), factor, *first, known)
+    low = np.array([rows[0] * factor - before[0], columns[0] * factor - before[1]])
+    origin = (_first_cell(grid) + low) * grid.cell
+    return SlabGrid(origin, grid.cell * factor, occupied, known, grid.n_slabs)
+
+
+def coarse_shape(grid: SlabGrid, factor: int) -> tuple[int, int]:
+    """Return the cells along x and y of the whole coarse grid."""
+    n_x, n_y = (
+        -(-(n + skip) // factor)
+        for n, skip in zip(grid.shape, _cells_before(grid, factor), strict=True)
+    )
+    return n_x, n_y
+
+
+def coarse_origin(grid: SlabGrid, factor: int) -> Float64s:
+    """Return the lower corner (2,) of the coarse grid's cell [0, 0], metres."""
+    if factor == 1:
+        return grid.origin
+    return np.asarray((_first_cell(grid) - _cells_before(grid, factor)) * grid.cell)
+
+
+def _first_cell(grid: SlabGrid) -> NDArray[np.int64]:
+    """Return the index of cell [0, 0] on the plane's own cells, counted from x = y = 0."""
+    return np.asarray(np.round(grid.origin / grid.cell), np.int64)
+
+
+def _cells_before(grid: SlabGrid, factor: int) -> tuple[int, int]:
+    """Return how many cells along x and y the first coarse cell holds before the grid begins."""
+    x, y = _first_cell(grid) % factor
+    return int(x), int(y)
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _join(bits, factor, first_i, first_j, out):  # type: ignore[no-untyped-def]
+    """Lay the bits over coarse cells; bits[0, 0] is the fine cell (first_i, first_j) of `out`."""
+    for i in range(bits.shape[0]):
+        row = out[(i + first_i) // factor]
+        for j in range(bits.shape[1]):
+            row[(j + first_j) // factor] |= bits[i, j]
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +148,8 @@ def list_columns(grid: SlabGrid) -> Columns:
     """Return the cells of `grid` that are known in any slab, in row order."""
     i, j = np.nonzero(grid.known)
     xy = grid.origin + (np.column_stack([i, j]) + 0.5) * grid.cell
-    return Columns(xy, grid.occupied[i, j], grid.known[i, j], grid.n_slabs)
+    occupied, known = (b[i, j].astype(np.uint32) for b in (grid.occupied, grid.known))
+    return Columns(xy, occupied, known, grid.n_slabs)
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
@@ -109,46 +166,95 @@ def scatter(xy, occupied, known, cosine, sine, cell, low, n_x, n_y):  # type: ig
     return out_occupied, out_known
 
 
-@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
-def unpack(bits, slabs, height, width):  # type: ignore[no-untyped-def]
-    """Return (len(slabs), height, width) float32 layers of the bits, zero-padded."""
-    out = np.zeros((slabs.shape[0], height, width), np.float32)
-    for k in range(slabs.shape[0]):
-        for i in range(bits.shape[0]):
-            for j in range(bits.shape[1]):
-                if (bits[i, j] >> slabs[k]) & 1:
-                    out[k, i, j] = 1.0
-    return out
+def unpack(arrays: Arrays, bits: Array, slab: int, dtype: Any) -> Array:
+    """Return one slab of the bits as a layer of ones and zeros; bits and layer on the device."""
+    one = bits.dtype.type(1)
+    return ((bits >> bits.dtype.type(slab)) & one).astype(dtype)
 
 
 @dataclass(frozen=True, eq=False)
 class Spectra:
-    """Forward transforms of one target: occupied and known layers, and the padded size."""
+    """Forward transforms of one target, and the translations that they serve.
 
-    occupied: NDArray[Any]
-    known: NDArray[Any]
-    shape: tuple[int, int]
+    occupied: (n_slabs, Nx, Ny // 2 + 1), known: the same, or (1, ...) where all slabs share it.
+    rows, columns: the translations [u, v] that are told. standing: of each slab, whether anything
+    is occupied in it.
+    """
+
+    occupied: Array
+    known: Array
+    source_shape: tuple[int, int]
+    rows: Range
+    columns: Range
     fft_shape: tuple[int, int]
     shared_known: bool
+    standing: tuple[bool, ...]
+    arrays: Arrays
+    dtype: Any
 
 
-def transform_target(grid: SlabGrid, source_shape: tuple[int, int], *, workers: int) -> Spectra:
-    """Return the target's spectra, padded so that no shift of such a source wraps round."""
-    size = [
-        fft.next_fast_len(t + s - 1, real=True)
-        for t, s in zip(grid.shape, source_shape, strict=True)
-    ]
-    slabs = np.arange(grid.n_slabs, dtype=np.uint32)
-    shared = _is_shared(grid.known, grid.n_slabs)
-    occupied = unpack(grid.occupied, slabs, *size)
-    known = unpack(grid.known, slabs[:1] if shared else slabs, *size)
-    return Spectra(
-        fft.rfft2(occupied, workers=workers),
-        fft.rfft2(known, workers=workers),
-        grid.shape,
-        (size[0], size[1]),
-        shared,
+def transform_target(
+    grid: SlabGrid,
+    source_shape: tuple[int, int],
+    *,
+    rows: Range | None = None,
+    columns: Range | None = None,
+    n_source: int | None = None,
+    arrays: Arrays = NUMPY,
+    workers: int = 1,
+) -> Spectra:
+    """Return the target's spectra, padded so that no translation asked for wraps round.
+
+    rows, columns: the translations [u, v] of `evidence_surface` to tell, by default all of them.
+    n_source: known cells of the source at most. The transforms are in single precision where it
+    restores whole numbers, else in double.
+    """
+    ranges = tuple(
+        (0, t + s - 1) if some is None else some
+        for some, t, s in zip((rows, columns), grid.shape, source_shape, strict=True)
     )
+    n_x, n_y = (
+        fft.next_fast_len(max(t, s, high, t + s - 1 - low), real=axis == 1)
+        for axis, ((low, high), t, s) in enumerate(
+            zip(ranges, grid.shape, source_shape, strict=True)
+        )
+    )
+    shared = _is_shared(grid.known, grid.n_slabs)
+    n_source = source_shape[0] * source_shape[1] if n_source is None else n_source
+    single = rounding((n_x, n_y), int(np.count_nonzero(grid.known)), n_source) < 0.5
+    dtype = np.float32 if single else np.float64
+
+    def spectra(bits: Bits, n_layers: int) -> Array:
+        placed = arrays.xp.asarray(bits)
+        shape = (n_layers, n_x, n_y // 2 + 1)
+        out = arrays.xp.empty(shape, np.result_type(dtype, np.complex64))
+        for k in range(n_layers):
+            layer = unpack(arrays, placed, k, dtype)[None]
+            out[k] = transform(arrays, layer, (n_x, n_y), workers)[0]
+        return out
+
+    return Spectra(
+        spectra(grid.occupied, grid.n_slabs),
+        spectra(grid.known, 1 if shared else grid.n_slabs),
+        source_shape,
+        ranges[0],
+        ranges[1],
+        (n_x, n_y),
+        shared,
+        _standing(grid.occupied, grid.n_slabs),
+        arrays,
+        dtype,
+    )
+
+
+def rounding(shape: tuple[int, int], n_target: int, n_source: int) -> float:
+    """Return how far counts of single precision may be off, cells.
+
+    eps / 2 per level of the transform, on the product of the layers' norms. Below 0.5, rounding
+    restores the counts; what was measured on dense layers was a seventh of this at most.
+    """
+    eps = float(np.finfo(np.float32).eps)
+    return 0.5 * eps * float(np.log2(shape[0] * shape[1])) * float(np.sqrt(n_target * n_source))
 
 
 def _is_shared(known: Bits, n_slabs: int) -> bool:
@@ -156,39 +262,64 @@ def _is_shared(known: Bits, n_slabs: int) -> bool:
     return bool(np.all((known == 0) | (known == full)))
 
 
+def _standing(occupied: Bits, n_slabs: int) -> tuple[bool, ...]:
+    """Return of each slab whether anything is occupied in it."""
+    any_of = int(np.bitwise_or.reduce(occupied, axis=None))
+    return tuple(bool(any_of >> k & 1) for k in range(n_slabs))
+
+
 def evidence_surface(
     target: Spectra, occupied: Bits, known: Bits, *, min_overlap: float, workers: int
 ) -> tuple[Float32s, Float32s]:
     """Return (evidence, overlap) at every translation of one turned source.
 
-    occupied, known: (sx, sy) slab bits of the source. Element [u, v] of the answers, of shape
-    (tx + sx - 1, ty + sy - 1), belongs to source cell [i, j] on target cell
-    [i + u - (sx - 1), j + v - (sy - 1)]. Poses with fewer than `min_overlap` known pairs in the
-    best known slab score -inf. overlap: known pairs, the largest over the slabs.
+    occupied, known: (sx, sy) slab bits of the source. Of all translations, (tx + sx - 1,
+    ty + sy - 1), the answers hold those of `target.rows` and `target.columns`. Translation [u, v]
+    lays source cell [i, j] on target cell [i + u - (sx - 1), j + v - (sy - 1)]. Poses with
+    fewer than `min_overlap` known pairs in the best known slab score -inf. overlap: known
+    pairs, the largest over the slabs. The answers are the same to the bit for any padding, any
+    number of workers and any array module: what the transforms count are whole numbers.
     """
-    n_slabs = target.occupied.shape[0]
-    slabs = np.arange(n_slabs, dtype=np.uint32)
+    arrays, n_slabs = target.arrays, len(target.standing)
     shared = target.shared_known and _is_shared(known, n_slabs)
-    size = target.fft_shape
-    s_occupied = fft.rfft2(unpack(occupied, slabs, *size), workers=workers)
-    s_known = fft.rfft2(unpack(known, slabs[:1] if shared else slabs, *size), workers=workers)
-    t_known = target.known if not shared else target.known[:1]
-    np.conjugate(s_occupied, out=s_occupied)
-    np.conjugate(s_known, out=s_known)
+    standing = _standing(occupied, n_slabs)
+    # turned round, a product of spectra is a cross-correlation
+    bits_occupied = arrays.xp.asarray(np.ascontiguousarray(occupied[::-1, ::-1]))
+    bits_known = arrays.xp.asarray(np.ascontiguousarray(known[::-1, ::-1]))
+    region = slice(*target.rows), slice(*target.columns)
 
-    def correlate(a: NDArray[Any], b: NDArray[Any]) -> Float32s:
-        return np.asarray(fft.irfft2(a * b, s=size, workers=workers), dtype=np.float32)
+    def forward(bits: Array, k: int, role: str) -> Array:
+        layer = unpack(arrays, bits, k, target.dtype)[None]
+        return transform(arrays, layer, target.fft_shape, workers, role)
 
-    pairs = correlate(s_known, t_known)
-    source_side = correlate(s_occupied, t_known)
-    target_side = correlate(s_known, target.occupied)
-    both = correlate(s_occupied, target.occupied)
-    n_u, n_v = (t + s - 1 for t, s in zip(target.shape, occupied.shape, strict=True))
-    score, overlap = _evidence_from_counts(
-        pairs, source_side, target_side, both, occupied.shape[0], occupied.shape[1],
-        n_u, n_v, float(min_overlap), xlogx_table(int(np.count_nonzero(known)) + 1),
-    )  # fmt: skip
-    return score, overlap
+    def correlate(a: Array, b: Array, role: str) -> Array:
+        out = borrow(arrays, "evidence product", a.shape, a.dtype)
+        product = arrays.xp.multiply(a, b[None], out=out)
+        return invert(arrays, product, target.fft_shape, workers, role)[0][region]
+
+    shape = tuple(high - low for low, high in (target.rows, target.columns))
+    total = arrays.xp.zeros(shape, np.float64)
+    overlap = arrays.xp.zeros(shape, np.float32)
+    table = arrays.xp.asarray(xlogx_table(int(np.count_nonzero(known)) + 1))
+    for k in range(n_slabs):
+        t_known = target.known[min(k, target.known.shape[0] - 1)]
+        if k == 0 or not shared:
+            s_known = forward(bits_known, k, "evidence known")
+            pairs = correlate(s_known, t_known, "evidence pairs")
+            overlap = arrays.xp.maximum(overlap, arrays.xp.floor(pairs + 0.5))
+        if not (standing[k] and target.standing[k]):
+            continue  # a side that never varies says nothing
+        s_occupied = forward(bits_occupied, k, "evidence occupied")
+        source_side = correlate(s_occupied, t_known, "evidence source side")
+        target_side = correlate(s_known, target.occupied[k], "evidence target side")
+        both = correlate(s_occupied, target.occupied[k], "evidence both")
+        counts = pairs, source_side, target_side, both
+        if arrays.name == "numpy":
+            _add_evidence(*counts, table, total)
+        else:
+            _add_evidence_on_device(arrays.xp, *counts, table, total)
+    score = arrays.xp.where(overlap >= min_overlap, total, -np.inf).astype(np.float32)
+    return arrays.to_host(score), arrays.to_host(overlap.astype(np.float32))
 
 
 def xlogx_table(n_max: int) -> Float64s:
@@ -211,37 +342,39 @@ def signed_evidence(n, r, c, n11, xlogx):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
-def _evidence_from_counts(  # type: ignore[no-untyped-def]
-    pairs, source_side, target_side, both, sx, sy, n_u, n_v, min_overlap, xlogx
-):
-    """Sum the evidence over slabs; index [u, v] is shift u - (sx - 1), v - (sy - 1), wrapped."""
-    height, width = both.shape[1], both.shape[2]
-    score = np.full((n_u, n_v), -np.inf, np.float32)
-    overlap = np.zeros((n_u, n_v), np.float32)
-    for u in range(n_u):
-        i = (u - (sx - 1)) % height
-        for v in range(n_v):
-            j = (v - (sy - 1)) % width
-            best = 0
-            for k in range(pairs.shape[0]):
-                best = max(best, int(pairs[k, i, j] + 0.5))
-            overlap[u, v] = best
-            if best < min_overlap:
-                continue
-            total = 0.0
-            for k in range(both.shape[0]):
-                n = int(pairs[k if pairs.shape[0] > 1 else 0, i, j] + 0.5)
-                r = int(source_side[k, i, j] + 0.5)
-                c = int(target_side[k, i, j] + 0.5)
-                n11 = max(int(both[k, i, j] + 0.5), r + c - n, 0)
-                total += signed_evidence(n, r, c, min(n11, r, c), xlogx)
-            score[u, v] = total
-    return score, overlap
+def _add_evidence(pairs, source_side, target_side, both, xlogx, total):  # type: ignore[no-untyped-def]
+    """Add the evidence of one slab to `total`, from its four counts, not yet rounded."""
+    for u in range(total.shape[0]):
+        for v in range(total.shape[1]):
+            n = int(pairs[u, v] + 0.5)
+            r = int(source_side[u, v] + 0.5)
+            c = int(target_side[u, v] + 0.5)
+            n11 = max(int(both[u, v] + 0.5), r + c - n, 0)
+            total[u, v] += signed_evidence(n, r, c, min(n11, r, c), xlogx)
+
+
+def _add_evidence_on_device(
+    xp: Any, pairs: Array, source_side: Array, target_side: Array, both: Array, xlogx: Array,
+    total: Array,
+) -> None:  # fmt: skip
+    """The same in whole arrays, each sum in the same order: the same bits."""
+    n, r, c, n11 = ((x + 0.5).astype(np.int32) for x in (pairs, source_side, target_side, both))
+    n11 = xp.minimum(xp.maximum(xp.maximum(n11, r + c - n), 0), xp.minimum(r, c))
+    g = xlogx[n] - xlogx[r] - xlogx[n - r] - xlogx[c] - xlogx[n - c]
+    g += xlogx[n11] + xlogx[r - n11] + xlogx[c - n11] + xlogx[n - r - c + n11]
+    varies = (r > 0) & (c > 0) & (r < n) & (c < n)
+    agrees = n11.astype(np.int64) * n > r.astype(np.int64) * c
+    total += (2.0 * agrees - 1.0) * g * varies
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
-def count_tables(t_occupied, t_known, origin, cell, xy, s_occupied, s_known, n_slabs, poses):  # type: ignore[no-untyped-def]
+def count_tables(  # type: ignore[no-untyped-def]
+    t_occupied, t_known, origin, cell, xy, s_occupied, s_known, n_slabs, poses, first_i=0, first_j=0
+):
     """Return the (n_poses, n_slabs, 4) tables n, n_1, n_2, n11 of columns at planar poses.
+
+    first_i, first_j: the cell of the grid at `origin` on which t_occupied[0, 0] lies, where only a
+    window of that grid is given; the window holds all that the columns reach.
 
     poses: (P, 3) x, y, yaw of the source in the frame of the target grid. The turned and shifted
     columns are gathered into the target's cells first, just as `scatter` does: at a shift of whole
@@ -257,14 +390,14 @@ def count_tables(t_occupied, t_known, origin, cell, xy, s_occupied, s_known, n_s
     known = np.empty((side, side), np.uint32)
     for p in range(poses.shape[0]):
         cosine, sine = np.cos(poses[p, 2]), np.sin(poses[p, 2])
-        i0 = int(np.floor((poses[p, 0] - origin[0]) / cell)) - side // 2
-        j0 = int(np.floor((poses[p, 1] - origin[1]) / cell)) - side // 2
+        i0 = int(np.floor((poses[p, 0] - origin[0]) / cell)) - side // 2 - first_i
+        j0 = int(np.floor((poses[p, 1] - origin[1]) / cell)) - side // 2 - first_j
         occupied[:] = 0
         known[:] = 0
         dx, dy = poses[p, 0] - origin[0], poses[p, 1] - origin[1]
         for n in range(xy.shape[0]):
-            i = int(np.floor((cosine * xy[n, 0] - sine * xy[n, 1] + dx) / cell))
-            j = int(np.floor((sine * xy[n, 0] + cosine * xy[n, 1] + dy) / cell))
+            i = int(np.floor((cosine * xy[n, 0] - sine * xy[n, 1] + dx) / cell)) - first_i
+            j = int(np.floor((sine * xy[n, 0] + cosine * xy[n, 1] + dy) / cell)) - first_j
             if 0 <= i < n_x and 0 <= j < n_y:
                 occupied[i - i0, j - j0] |= s_occupied[n]
                 known[i - i0, j - j0] |= s_known[n]

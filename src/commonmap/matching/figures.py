@@ -10,8 +10,9 @@ from commonmap.frames import apply
 from commonmap.mapping.points import sample
 from commonmap.matching.decide import Figures
 from commonmap.matching.evidence import coarsen, list_columns
+from commonmap.matching.inliers import share_of_inliers
 from commonmap.matching.maps import Layers, Points, Prepared
-from commonmap.matching.refine import Refined, share_of_inliers
+from commonmap.matching.refine import Refined
 from commonmap.matching.search import Peaks, centre_columns, evidence_at
 from commonmap.matching.support import measure_support
 from commonmap.types import Bools, Float64s
@@ -73,8 +74,9 @@ def other_poses(peaks: Peaks, pose: Float64s, cell: float) -> Bools:
 
 def measure_inliers(base: Points, draft: Points, T_target_source: Float64s, cell: float) -> float:
     """Return the share of the draft's standing points near standing points of the base."""
-    placed = apply(T_target_source, draft.xyz)
-    return share_of_inliers(base.xyz, base.standing, placed, draft.standing, 0.6 * cell)
+    return share_of_inliers(
+        base.xyz, base.standing, draft.xyz, draft.standing, T_target_source, reach=0.6 * cell
+    )
 
 
 def mirror(draft: Points, decoy: Peaks) -> Points:

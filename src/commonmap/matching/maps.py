@@ -12,11 +12,13 @@ from commonmap.frames import apply, from_rotation
 from commonmap.mapping.ground import Ground, find_ground
 from commonmap.mapping.height_map import build_height_map, choose_cell, choose_slabs
 from commonmap.mapping.level import Levelling, find_level, no_levelling
-from commonmap.mapping.points import bounds, points_of, sample
+from commonmap.mapping.points import bounds, inside_box, points_of, sample, thin
 from commonmap.matching.evidence import SlabGrid, pack_slabs
-from commonmap.matching.refine import thin
 from commonmap.metrics.table import METRICS
 from commonmap.types import Bools, Cloud, Float64s, GridMap, Leaves
+
+MOST_POINTS = 2_000_000
+"""Points of a map that the refinement and the verdict look at."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,8 +104,9 @@ def choose_grid(
 def build_layers(item: Prepared, cell: float, edges: Float64s, max_height: float | None) -> Layers:
     """Return the layers of a prepared map on half of `cell`."""
     grid = build_height_map(
-        item.xyz, cell=0.5 * cell, slab_edges=edges, ground=item.ground, max_height=max_height
-    )
+        item.xyz, cell=0.5 * cell, slab_edges=edges, ground=item.ground, max_height=max_height,
+        height=item.height,
+    )  # fmt: skip
     slabs = pack_slabs(grid.origin, grid.cell, grid["slab_occupied"], grid["slab_known"])
     return Layers(grid, slabs)
 
@@ -120,9 +123,7 @@ def choose_points(
     used = np.ones(len(item.xyz), bool) if max_height is None else item.height < max_height
     if around is not None:
         low, high = bounds(around)
-        for a in range(2):
-            used &= item.xyz[:, a] >= low[a] - 3.0 * cell
-            used &= item.xyz[:, a] <= high[a] + 3.0 * cell
-    xyz = thin(item.xyz[used], min(0.25 * cell, 0.1))
+        used &= inside_box(item.xyz, (low - 3.0 * cell)[:2], (high + 3.0 * cell)[:2])
+    xyz = thin(sample(item.xyz[used], MOST_POINTS), min(0.25 * cell, 0.1))
     height = xyz[:, 2] - item.ground.height_at(xyz[:, :2])
     return Points(xyz, height, height > edges[0])

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from typing import TypeVar
 
 import numpy as np
 
@@ -30,6 +32,7 @@ from commonmap.matching.figures import (
 )
 from commonmap.matching.maps import (
     Layers,
+    Points,
     Prepared,
     build_layers,
     choose_grid,
@@ -50,6 +53,9 @@ from commonmap.types import (
     SearchPicture,
     no_progress,
 )
+
+First = TypeVar("First")
+Second = TypeVar("Second")
 
 WORKERS = 2
 """Threads; the answer does not depend on them."""
@@ -76,17 +82,19 @@ def match(
 
     # 1. each map: points, level, ground
     with _timed(timings, "prepare"):
-        progress("prepare the target")
-        base = prepare(target, "target", config)
-        progress("prepare the source")
-        draft = prepare(source, "source", config)
+        progress("prepare the maps")
+        base, draft = _both(
+            lambda: prepare(target, "target", config), lambda: prepare(source, "source", config)
+        )
 
     # 2. height slabs of both on one cell size, taken from the data
     with _timed(timings, "grid"):
         progress("height maps")
         cell, edges, max_height = choose_grid(base, draft, config)
-        base_layers = build_layers(base, cell, edges, max_height)
-        draft_layers = build_layers(draft, cell, edges, max_height)
+        base_layers, draft_layers = _both(
+            lambda: build_layers(base, cell, edges, max_height),
+            lambda: build_layers(draft, cell, edges, max_height),
+        )
 
     # 3. every x, y and yaw; and again with the source mirrored
     with _timed(timings, "search"):
@@ -101,35 +109,25 @@ def match(
             witness = _search(base_layers, draft_layers, by_evidence, False, progress)
             witness_decoy = _search(base_layers, draft_layers, by_evidence, True, progress)
 
-    # 4. z in closed form, then all six degrees of freedom on the points
-    with _timed(timings, "refine"):
-        progress("refine")
-        draft_points = choose_points(draft, cell, edges, max_height)
-        base_points, refined = draft_points, None
-        if len(found.score):
-            T = lift(found.T_target_source(), base.ground, draft.ground)
-            around = apply(T, draft_points.xyz)
-            base_points = choose_points(base, cell, edges, max_height, around=around)
-            refined = refine(base_points.xyz, draft_points.xyz, T, cell=max(cell, found.cell))
+    # 4. z in closed form, then all six degrees of freedom on the points; and the same for the
+    #    mirrored source: how well points lie on each other at a pose that cannot be right
+    refined: Refined | None = None
+    inliers = chance = 0.0
+    if len(found.score):
+        with _timed(timings, "refine"):
+            progress("refine")
+            points = choose_points(draft, cell, edges, max_height)
+            best, chance = _both(
+                lambda: _refine(base, draft, points, found, cell, edges, max_height),
+                lambda: _chance(base, points, witness_decoy, cell, edges, max_height),
+            )
+            refined, inliers = best
 
     # 5. believe it or not
     with _timed(timings, "decide"):
         progress("decide")
         figures = Figures(*[0.0] * 14)
         if refined is not None:
-            inliers = measure_inliers(base_points, draft_points, refined.T_target_source, cell)
-            chance = 0.0
-            if len(witness_decoy.score):
-                # How well points lie at a pose that cannot be right
-                mirrored = mirror(draft_points, witness_decoy)
-                T = lift_mirrored(witness_decoy.T_target_source(), base, mirrored)
-                around = apply(T, mirrored.xyz)
-                there = choose_points(base, cell, edges, max_height, around=around)
-                again = refine(
-                    there.xyz, mirrored.xyz, T, cell=max(cell, witness_decoy.cell), n_most=8_000,
-                    settle=False,
-                )  # fmt: skip
-                chance = measure_inliers(there, mirrored, again.T_target_source, cell)
             figures = measure_figures(
                 base_layers, draft_layers, found, witness, witness_decoy, refined, inliers, chance,
                 cell,
@@ -139,6 +137,33 @@ def match(
             verdict = Verdict(True, verdict.confidence, "accepted unseen, as decide.mode is off")
         picture = _draw(base_layers.slabs, draft_layers.slabs, base, draft, found, decoy, config)
     return _answer(base, draft, found, decoy, refined, figures, verdict, config, timings, picture)
+
+
+def _refine(
+    base: Prepared, draft: Prepared, points: Points, found: Peaks, cell: float, edges: Float64s,
+    max_height: float | None,
+) -> tuple[Refined, float]:  # fmt: skip
+    """Return the best pose refined, and the share of inliers there."""
+    T = lift(found.T_target_source(), base.ground, draft.ground)
+    there = choose_points(base, cell, edges, max_height, around=apply(T, points.xyz))
+    refined = refine(there.xyz, points.xyz, T, cell=max(cell, found.cell))
+    return refined, measure_inliers(there, points, refined.T_target_source, cell)
+
+
+def _chance(
+    base: Prepared, points: Points, decoy: Peaks, cell: float, edges: Float64s,
+    max_height: float | None,
+) -> float:  # fmt: skip
+    """Return the share of inliers at the refined pose of the mirrored source."""
+    if len(decoy.score) == 0:
+        return 0.0
+    mirrored = mirror(points, decoy)
+    T = lift_mirrored(decoy.T_target_source(), base, mirrored)
+    there = choose_points(base, cell, edges, max_height, around=apply(T, mirrored.xyz))
+    refined = refine(
+        there.xyz, mirrored.xyz, T, cell=max(cell, decoy.cell), n_most=8_000, settle=False
+    )
+    return measure_inliers(there, mirrored, refined.T_target_source, cell)
 
 
 def least_overlap(config: Config) -> float:
@@ -269,6 +294,13 @@ def _draw(
         best_per_yaw=found.per_yaw[:, 1],
         decoy_best=float(decoy.per_yaw[:, 1].max()) if len(decoy.score) else 0.0,
     )
+
+
+def _both(first: Callable[[], First], second: Callable[[], Second]) -> tuple[First, Second]:
+    """Return what both functions return, side by side."""
+    with ThreadPoolExecutor(max_workers=WORKERS) as pool:
+        one, other = pool.submit(first), pool.submit(second)
+        return one.result(), other.result()
 
 
 @contextmanager

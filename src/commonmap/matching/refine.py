@@ -12,16 +12,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from commonmap.frames import apply, from_rotation
 from commonmap.mapping.ground import Ground
-from commonmap.mapping.points import bounds
-from commonmap.types import Bools, Float64s
+from commonmap.mapping.points import bounds, inside_box, thin
+from commonmap.types import Float64s
 
 AREAS = 4
 """Areas along the longer side of the plan that count as observations of the pose."""
@@ -101,7 +99,7 @@ def refine(
     moved_source = apply(start, source_xyz)
     low, high = bounds(moved_source)
     low, high = low - 2.0 * cell, high + 2.0 * cell
-    inside = _inside(target_xyz, low, high)
+    inside = inside_box(target_xyz, low, high)
     if np.count_nonzero(inside) < 20 or len(source_xyz) < 20:
         return _unrefined(start, source_xyz)
 
@@ -183,58 +181,6 @@ def _unrefined(start: Float64s, source_xyz: Float64s) -> Refined:
     return Refined(start, centre, np.eye(6), float("inf"), (0.0, 0.0), False)
 
 
-def _inside(points: Float64s, low: Float64s, high: Float64s) -> Bools:
-    """Return (N,) bool, the points within a box, coordinate by coordinate (a third of the time)."""
-    inside = np.ones(len(points), dtype=bool)
-    for a in range(points.shape[1]):
-        inside &= (points[:, a] >= low[a]) & (points[:, a] <= high[a])
-    return inside
-
-
-def thin(xyz: Float64s, voxel: float, n_most: int | None = None) -> Float64s:
-    """Return the mean point of every voxel, the voxel widened until about `n_most` are left."""
-    if len(xyz) == 0:
-        return xyz
-    for _ in range(8):
-        order, starts = _group(xyz, voxel)
-        if n_most is None or len(starts) - 1 <= n_most:
-            break
-        voxel *= max(1.15, math.sqrt((len(starts) - 1) / n_most) * 0.95)
-    return np.asarray(_means(xyz, order, starts))
-
-
-def _group(xyz: Float64s, voxel: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the points' order by voxel, and where each voxel starts in it."""
-    key = _voxel_keys(np.ascontiguousarray(xyz), 1.0 / voxel)
-    order = np.argsort(key, kind="stable")
-    edges = np.nonzero(np.diff(key[order]))[0] + 1
-    return order, np.concatenate([[0], edges, [len(key)]]).astype(np.int64)
-
-
-@numba.njit(cache=True)  # type: ignore[misc]
-def _voxel_keys(xyz, scale):  # type: ignore[no-untyped-def]
-    """Return one int64 per point, 21 bits an axis: equal for the points of one voxel."""
-    key = np.empty(xyz.shape[0], np.int64)
-    for n in range(xyz.shape[0]):
-        i = int(np.floor(xyz[n, 0] * scale)) & 0x1FFFFF
-        j = int(np.floor(xyz[n, 1] * scale)) & 0x1FFFFF
-        k = int(np.floor(xyz[n, 2] * scale)) & 0x1FFFFF
-        key[n] = (i << 42) | (j << 21) | k
-    return key
-
-
-@numba.njit(cache=True)  # type: ignore[misc]
-def _means(xyz, order, starts):  # type: ignore[no-untyped-def]
-    out = np.zeros((starts.shape[0] - 1, 3))
-    for v in range(starts.shape[0] - 1):
-        for n in range(starts[v], starts[v + 1]):
-            for a in range(3):
-                out[v, a] += xyz[order[n], a]
-        for a in range(3):
-            out[v, a] /= starts[v + 1] - starts[v]
-    return out
-
-
 def _solve_point_to_plane(
     target: Float64s, normals: Float64s, source: Float64s, T: Float64s, *, reach: float
 ) -> tuple[Float64s, Float64s, float]:
@@ -300,32 +246,3 @@ def _overdispersion(
     # Six parameters were fitted to the areas: what they took away is given back
     share = max(len(found) - 1.0, 1.0) / len(found)
     return max(noise, float(np.average(found, weights=weight)) / share)
-
-
-def share_of_inliers(
-    target: Float64s, target_standing: Bools, source: Float64s, source_standing: Bools, reach: float
-) -> float:
-    """Return how many standing source points over known columns lie near a standing target point.
-
-    target, source: (N, 3), (M, 3) in one frame. standing: masks of what rises above the ground (the
-    ground itself lies on the ground anywhere). reach: metres. 0 where nothing stands over known
-    columns; at most 20,000 source points are looked at.
-    """
-    draft = source[source_standing]
-    draft = draft[:: len(draft) // 20_000 + 1]
-    if len(draft) == 0 or not target_standing.any():
-        return 0.0
-    low, high = bounds(draft)
-    low, high = low - reach, high + reach
-    inside = _inside(target[:, :2], low, high)
-    base = thin(target[inside], 0.5 * reach, 1_000_000) if inside.any() else target[:0]
-    upright = target[inside & target_standing]
-    if len(base) == 0 or len(upright) == 0:
-        return 0.0
-    upright = thin(upright, 0.3 * reach, 1_000_000)
-    columns = np.unique(np.floor(base[:, :2] / reach).astype(np.int64), axis=0)
-    over, _ = cKDTree((columns + 0.5) * reach).query(draft[:, :2], distance_upper_bound=reach)
-    near, _ = cKDTree(upright).query(draft, distance_upper_bound=reach)
-    known = np.isfinite(over)
-    n = int(np.count_nonzero(known))
-    return float(np.count_nonzero(np.isfinite(near) & known) / n) if n else 0.0
