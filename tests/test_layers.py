@@ -18,7 +18,7 @@ LAYERS = (
     ("matching",),
     ("merging",),
     ("sim",),
-    ("pipeline",),
+    ("pipeline", "pipeline_logs"),
     ("study", "report", "cli", "cli_progress", "cli_results", "__init__"),
 )
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}

@@ -12,11 +12,11 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from commonmap.errors import InputError, OutputError
-from commonmap.frames import angle, apply, from_rotation, from_xyz_yaw, invert
+from commonmap.frames import angle, apply, fit_motion, from_rotation, from_xyz_yaw, invert
 from commonmap.io.las import read_las
 from commonmap.sim.drift import add_drift, relative_error
 from commonmap.sim.missions import Area, drive, flight_level, fly
-from commonmap.sim.pairs import Pair, fit_motion, measure_overlap, simulate_pair
+from commonmap.sim.pairs import Pair, measure_overlap, simulate_pair
 from commonmap.sim.routes import free_space
 from commonmap.sim.scanning import RayCaster
 from commonmap.sim.simulate import tell_truth, write_simulation

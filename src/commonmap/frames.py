@@ -102,6 +102,15 @@ def difference(T_a_b: Float64s, T_a_b_other: Float64s, centre_b: ArrayLike) -> t
     return distance, angle(T_a_b[:3, :3].T @ T_a_b_other[:3, :3])
 
 
+def fit_motion(points_a: Float64s, points_b: Float64s) -> Float64s:
+    """Return T_a_b that takes (N, 3) points of b onto those of a with least squares (Kabsch)."""
+    centre_a, centre_b = points_a.mean(axis=0), points_b.mean(axis=0)
+    U, _, Vt = np.linalg.svd((points_a - centre_a).T @ (points_b - centre_b))
+    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
+    R = U @ sign @ Vt
+    return from_rotation(R, centre_a - R @ centre_b)
+
+
 def rotation_between(a: ArrayLike, b: ArrayLike) -> Float64s:
     """Return the smallest rotation (3, 3) that takes direction `a` onto direction `b`."""
     u = np.asarray(a, dtype=np.float64) / np.linalg.norm(a)

@@ -28,7 +28,7 @@ def georeference(
     motions = np.zeros((max(len(time) - 1, 1), 6))
     for k in range(len(time) - 1):
         motions[k] = T_to_motion(invert(T[k]) @ T[k + 1])
-    limit = 2.0 * float(np.median(np.diff(time))) if len(time) > 1 else np.inf
+    limit = _limit(time)
     for number, scan in enumerate(scans):
         xyz = np.asarray(scan.xyz, np.float64)
         fit = np.isfinite(xyz).all(axis=1) & (np.square(xyz).sum(axis=1) > min_range**2)
@@ -42,6 +42,20 @@ def georeference(
         yield Cloud(
             xyz=placed, time=t, origin=origin.astype(np.float32), intensity=scan.intensity[fit]
         )
+
+
+def covers(trajectory: Trajectory, scan: Scan) -> bool:
+    """Return whether `georeference` can place every point of a scan."""
+    time, limit = np.asarray(trajectory.time, np.float64), _limit(trajectory.time)
+    t = np.asarray(scan.time, np.float64)
+    if not len(t):
+        return True
+    return bool(t.min() >= time[0] - limit and t.max() <= time[-1] + limit)
+
+
+def _limit(time: Float64s) -> float:
+    """Return how far before the first and after the last pose the motion is taken to go on."""
+    return 2.0 * float(np.median(np.diff(time))) if len(time) > 1 else np.inf
 
 
 def _place(

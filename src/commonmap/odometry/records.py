@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+
+import numpy as np
 
 from commonmap.types import Float64s, Trajectory
 
@@ -35,6 +37,35 @@ class ScanHealth:
             return ""
         named = " and ".join(name_direction(row) for row in self.degenerate)
         return f"at {self.moment:.2f} s the scene does not hold {named}"
+
+    def turned(self, R: Float64s) -> ScanHealth:
+        """Return the same in a map frame turned by R (3, 3)."""
+        parts = self.degenerate[:, :3] @ R.T, self.degenerate[:, 3:] @ R.T
+        return replace(self, degenerate=np.hstack(parts))
+
+
+@dataclass(frozen=True, eq=False)
+class Trouble:
+    """A stretch of turns whose poses are not to be relied on.
+
+    kind: "lost" (the poses are guesses) or "degenerate" (along some directions they are).
+    begin, end: seconds, moments of the first and the last turn. n: turns.
+    directions: (K, 6) as in `ScanHealth.degenerate`, of the turn in the middle.
+    """
+
+    kind: str
+    begin: float
+    end: float
+    n: int
+    directions: Float64s
+
+    def tell(self) -> str:
+        """Return the trouble as a sentence."""
+        stretch = f"from {self.begin:.2f} to {self.end:.2f} s"
+        if self.kind == "lost":
+            return f"odometry is lost {stretch} ({self.n} turns)"
+        named = " and ".join(name_direction(row) for row in self.directions)
+        return f"{stretch} ({self.n} turns) the scene does not hold {named}"
 
 
 def name_direction(direction: Float64s) -> str:

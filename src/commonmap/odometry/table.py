@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from itertools import chain, islice
@@ -13,9 +13,10 @@ import numpy as np
 from commonmap.errors import InputError, MissingExtraError
 from commonmap.frames import check_T
 from commonmap.odometry.geometry import complete_scans
+from commonmap.odometry.georeference import covers
 from commonmap.odometry.kiss import estimate_kiss_icp
 from commonmap.odometry.loam import Loam, LoamOptions
-from commonmap.odometry.records import Odometry, ScanHealth
+from commonmap.odometry.records import Odometry, ScanHealth, Trouble
 from commonmap.types import Progress, Scan, Trajectory, no_progress
 
 log = logging.getLogger(__name__)
@@ -146,24 +147,29 @@ def try_deskew(first: list[Scan], options: LoamOptions) -> tuple[LoamOptions, st
     return replace(options, deskew=chosen), note
 
 
-def describe_health(health: list[ScanHealth]) -> tuple[str, ...]:
+def describe_health(health: Sequence[ScanHealth]) -> tuple[str, ...]:
     """Return one sentence for each stretch of turns in trouble."""
-    notes: list[str] = []
+    return tuple(trouble.tell() for trouble in find_troubles(health))
+
+
+def find_troubles(health: Sequence[ScanHealth]) -> tuple[Trouble, ...]:
+    """Return the stretches of turns in trouble, in order of time."""
+    troubles: list[Trouble] = []
     start = 0
-    kinds = ["lost" if h.lost else "open" if len(h.degenerate) else "" for h in health]
+    kinds = ["lost" if h.lost else "degenerate" if len(h.degenerate) else "" for h in health]
     for k in range(1, len(kinds) + 1):
         if k < len(kinds) and kinds[k] == kinds[start]:
             continue
         if kinds[start]:
-            stretch = f"from {health[start].moment:.2f} to {health[k - 1].moment:.2f} s"
-            if kinds[start] == "lost":
-                notes.append(f"odometry is lost {stretch} ({k - start} turns)")
-            else:
-                middle = health[(start + k) // 2] if k - start > 1 else health[start]
-                told = middle.tell().split(" s ", 1)[1]
-                notes.append(f"{stretch} ({k - start} turns) {told}")
+            middle = health[(start + k) // 2] if k - start > 1 else health[start]
+            troubles.append(
+                Trouble(
+                    kinds[start], health[start].moment, health[k - 1].moment, k - start,
+                    middle.degenerate,
+                )
+            )  # fmt: skip
         start = k
-    return tuple(notes)
+    return tuple(troubles)
 
 
 def take_poses(scans: Iterable[Scan], poses: Trajectory, progress: Progress) -> Odometry:
@@ -172,18 +178,18 @@ def take_poses(scans: Iterable[Scan], poses: Trajectory, progress: Progress) -> 
     if len(poses.time) < 2 or len(T) != len(poses.time) or (np.diff(poses.time) <= 0).any():
         raise InputError("known poses must be at least two, with rising times")
     progress("odometry")
-    first = last = None
+    known = Trajectory(np.asarray(poses.time, np.float64), T)
+    stamps, n_outside = [], 0
     for scan in scans:
-        first = scan.stamp if first is None else first
-        last = scan.stamp
-    assert first is not None and last is not None
-    step = float(np.median(np.diff(poses.time)))
-    if first < poses.time[0] - step or last > poses.time[-1] + step:
+        stamps.append(scan.stamp)
+        n_outside += not covers(known, scan)
+    if n_outside == len(stamps):
         raise InputError(
-            f"known poses must cover the scans ({first:.3f} to {last:.3f} s); they are of "
-            f"{poses.time[0]:.3f} to {poses.time[-1]:.3f} s"
+            f"known poses must cover the scans ({stamps[0]:.3f} to {stamps[-1]:.3f} s); they are "
+            f"of {poses.time[0]:.3f} to {poses.time[-1]:.3f} s"
         )
-    return Odometry("poses", Trajectory(np.asarray(poses.time, np.float64), T), ())
+    outside = f"{n_outside} of {len(stamps)} turns lie outside the time of the known poses"
+    return Odometry("poses", known, (), (outside,) if n_outside else ())
 
 
 def _run_kiss_icp(

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from commonmap.errors import InputError
-from commonmap.frames import from_rotation, from_xyz_yaw, invert
+from commonmap.frames import fit_motion, from_rotation, from_xyz_yaw, invert
 from commonmap.sim.drift import add_drift
 from commonmap.sim.missions import Area, Mission, drive, fly
 from commonmap.sim.scanning import (
@@ -67,6 +67,47 @@ class Pair:
     seed_world: int
 
 
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A place and the true ways of two robots through it.
+
+    world, source_world: the place as the drone, and as the ground robot met it. flight, ground:
+    their missions. base_area, draft_area: where they went. seed_world: what the place is made of.
+    """
+
+    world: World
+    source_world: World
+    flight: Mission
+    ground: Mission
+    base_area: Area
+    draft_area: Area
+    seed_world: int
+
+
+def plan_missions(
+    kind: str, *, rng: np.random.Generator, seed_world: int | None = None, change: float = 0.0,
+    size: float | None = None, relief: float | None = None, draft_size: float | None = None,
+    height: float | None = None, pitch: float | None = None,
+) -> Plan:  # fmt: skip
+    """Return a place, a flight over all of it, and a drive in a part of it; see `simulate_pair`."""
+    if seed_world is None:
+        seed_world = int(rng.integers(2**31))
+    world = build_world(kind, np.random.default_rng(seed_world), size=size, relief=relief)
+    visited = change_world(world, change, rng) if change > 0 else world
+    edge = draft_size if draft_size is not None else 0.45 * world.size
+    room = max(0.0, (world.size - edge) / 2 - 2.0)
+    x, y = rng.uniform(-room, room, 2)
+    draft_area = Area(x, y, edge, edge, rng.uniform(0.0, 2 * np.pi) if room > 0.2 * edge else 0.0)
+    base_area = Area(0.0, 0.0, world.size, world.size, float(rng.integers(4)) * np.pi / 2)
+    ground = drive(visited, draft_area, rng)
+    flight = fly(
+        world, base_area, rng,
+        height=float(rng.uniform(18.0, 30.0)) if height is None else height,
+        pitch=float(np.radians(rng.uniform(60.0, 90.0))) if pitch is None else pitch,
+    )  # fmt: skip
+    return Plan(world, visited, flight, ground, base_area, draft_area, seed_world)
+
+
 def simulate_pair(
     kind: str,
     *,
@@ -106,23 +147,13 @@ def simulate_pair(
     """
     if not 0.0 < overlap <= 1.0:
         raise InputError(f"overlap must lie above 0 and up to 1; {overlap} came")
-    if seed_world is None:
-        seed_world = int(rng.integers(2**31))
-    world = build_world(kind, np.random.default_rng(seed_world), size=size, relief=relief)
-    visited = change_world(world, change, rng) if change > 0 else world
-
     # 1. where each robot goes
-    edge = draft_size if draft_size is not None else 0.45 * world.size
-    room = max(0.0, (world.size - edge) / 2 - 2.0)
-    x, y = rng.uniform(-room, room, 2)
-    draft_area = Area(x, y, edge, edge, rng.uniform(0.0, 2 * np.pi) if room > 0.2 * edge else 0.0)
-    base_area = Area(0.0, 0.0, world.size, world.size, float(rng.integers(4)) * np.pi / 2)
-    ground = drive(visited, draft_area, rng)
-    flight = fly(
-        world, base_area, rng,
-        height=float(rng.uniform(18.0, 30.0)) if height is None else height,
-        pitch=float(np.radians(rng.uniform(60.0, 90.0))) if pitch is None else pitch,
+    plan = plan_missions(
+        kind, rng=rng, seed_world=seed_world, change=change, size=size, relief=relief,
+        draft_size=draft_size, height=height, pitch=pitch,
     )  # fmt: skip
+    world, visited, ground, flight = plan.world, plan.source_world, plan.ground, plan.flight
+    base_area, draft_area = plan.base_area, plan.draft_area
 
     # 2. what each lidar measures, in the world's frame
     caster = RayCaster(world)
@@ -160,7 +191,7 @@ def simulate_pair(
         kind, target, source, invert(T_world_target_fit) @ T_world_source_fit,
         target_known, source_known, flight, ground, T_world_target_fit, T_world_source_fit,
         measure_overlap(base_true, draft_true), drift, tilt, change,
-        border, max_range, world, visited, seed_world,
+        border, max_range, world, visited, plan.seed_world,
     )  # fmt: skip
 
 
@@ -174,15 +205,6 @@ def random_frame(rng: np.random.Generator, tilt: float) -> Float64s:
     about = rng.uniform(0.0, 2 * np.pi)
     lean = Rotation.from_rotvec(tilt * np.array([np.cos(about), np.sin(about), 0.0]))
     return T @ from_rotation(lean.as_matrix())
-
-
-def fit_motion(points_a: Float64s, points_b: Float64s) -> Float64s:
-    """Return T_a_b that takes (N, 3) points of b onto those of a with least squares (Kabsch)."""
-    centre_a, centre_b = points_a.mean(axis=0), points_b.mean(axis=0)
-    U, _, Vt = np.linalg.svd((points_a - centre_a).T @ (points_b - centre_b))
-    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
-    R = U @ sign @ Vt
-    return from_rotation(R, centre_a - R @ centre_b)
 
 
 def measure_overlap(target: Float64s, source: Float64s, *, cell: float = OVERLAP_CELL) -> float:

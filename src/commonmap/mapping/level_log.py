@@ -1,0 +1,69 @@
+"""Which way is up in the map of a log, whose frame is that of the sensor at the start.
+
+A lidar may be mounted anyhow: a drone's looks straight down. Two things tell the vertical. The
+attitude: a robot that turns does so about the vertical, a drone exactly but for its sway, a ground
+robot about the normal of the ground it stands on. And what stands upright (`mapping.level`), which
+is not misled by a slope. The attitude says it roughly, upright things exactly; where there are none
+the attitude stands.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from commonmap.frames import from_rotation, rotation_between
+from commonmap.mapping.level import Levelling, find_level
+from commonmap.mapping.points import sample
+from commonmap.types import Cloud, Float64s, Trajectory
+
+LEAST_GAP = 0.1
+"""The mean rotation must keep one direction by so much better than the next: a robot that went
+straight ahead has turned about nothing."""
+
+NEAREST = 0.05
+"""Share of the points, the nearest, that tell on which side of the sensor the ground is."""
+
+
+def level_log(cloud: Cloud, trajectory: Trajectory) -> Levelling:
+    """Return the rotation about the origin that makes a log's map level.
+
+    cloud: of the map, with ray origins. trajectory: of the sensor in the same frame.
+    """
+    up = find_turn_axis(cloud, trajectory)
+    if up is None:
+        return find_level(cloud.xyz)
+    R_rough = rotation_between(up, (0.0, 0.0, 1.0))
+    found = find_level(cloud.xyz @ R_rough.T)
+    R = found.T_level_map[:3, :3] @ R_rough
+    tilt = math.acos(float(np.clip(R[2, 2], -1.0, 1.0)))
+    if math.isfinite(found.sigma):
+        how = f"upright things agree within {math.degrees(found.sigma):.2f} deg"
+    else:
+        how = "nothing upright was found; up is the axis about which the sensor turned"
+    reason = f"turned by {math.degrees(tilt):.2f} deg: {how}"
+    return Levelling(from_rotation(R), tilt, found.sigma, reason)
+
+
+def find_turn_axis(cloud: Cloud, trajectory: Trajectory) -> Float64s | None:
+    """Return the direction (3,) of the map about which the sensor turned, away from the ground.
+
+    The mean of all rotations shrinks every direction but the axis: its first singular vectors are
+    the axis in the map and in the sensor. None where the robot did not turn enough to tell.
+    """
+    mean = trajectory.T_map_sensor[:, :3, :3].mean(axis=0)
+    U, size, _ = np.linalg.svd(mean)
+    if size[0] - size[1] < LEAST_GAP:
+        return None
+    axis: Float64s = U[:, 0]
+    return axis if _ground_lies_below(cloud, axis) else -axis
+
+
+def _ground_lies_below(cloud: Cloud, axis: Float64s) -> bool:
+    """Return whether what is nearest to the sensor lies on the other side of it than `axis`."""
+    assert cloud.origin is not None
+    ray = sample(cloud.xyz - cloud.origin, 200_000)
+    distance = np.linalg.norm(ray, axis=1)
+    near = distance <= np.quantile(distance, NEAREST)
+    return float(np.mean(ray[near] @ axis)) <= 0.0

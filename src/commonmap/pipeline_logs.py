@@ -1,0 +1,222 @@
+"""From the turns of a lidar to a level map: odometry, georeferencing, levelling, on one page.
+
+No file is opened here: turns come in, answers go out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from commonmap.errors import InputError
+from commonmap.frames import apply
+from commonmap.mapping.level import Levelling, no_levelling
+from commonmap.mapping.level_log import level_log
+from commonmap.odometry import (
+    Accumulator,
+    Odometry,
+    TrajectoryErrors,
+    Trouble,
+    covers,
+    describe_health,
+    estimate,
+    find_troubles,
+    georeference,
+)
+from commonmap.odometry.geometry import complete_scans
+from commonmap.types import Cloud, Float64s, Progress, Scan, Trajectory, no_progress
+
+MAX_POINTS = 1_500_000
+"""Points of a log's map; voxels widen until there are no more."""
+
+LOST_SHARE = 0.5
+"""A log of which more turns than this are lost gives no map."""
+
+
+@dataclass(frozen=True, eq=False)
+class RobotMap:
+    """What a robot's log became.
+
+    cloud: deskewed, thinned, with time and ray origins, in the frame of the map: level, z up, its
+    origin where the sensor was at first (of known poses: in the frame of the poses).
+    trajectory: of the sensor in the same frame. odometry: the answer as estimated, its health in
+    the frame of the map. levelling: how the first sensor frame was turned. voxel: metres, of the
+    thinning. n_turns: of the log. n_left_out: turns that are not in the cloud, since their pose is
+    a guess or not known. notes: sentences for the user.
+    """
+
+    cloud: Cloud
+    trajectory: Trajectory
+    odometry: Odometry
+    levelling: Levelling
+    voxel: float
+    n_turns: int
+    n_left_out: int
+    notes: tuple[str, ...]
+
+    @property
+    def troubles(self) -> tuple[Trouble, ...]:
+        """When, and along which directions of the map, the poses are not to be relied on."""
+        return find_troubles(self.odometry.health)
+
+    @property
+    def way(self) -> float:
+        """Metres that the sensor went."""
+        steps = np.diff(self.trajectory.T_map_sensor[:, :3, 3], axis=0)
+        return float(np.linalg.norm(steps, axis=1).sum())
+
+
+def map_log(
+    read: Callable[[], Iterable[Scan]],
+    *,
+    method: str = "loam",
+    poses: Trajectory | None = None,
+    max_points: int = MAX_POINTS,
+    n_scans: int | None = None,
+    name: str = "the log",
+    progress: Progress = no_progress,
+) -> RobotMap:
+    """Return the level map of a log and the way of the sensor in it.
+
+    read: gives the turns from the first on; it is called twice, and no more than a few turns are in
+        memory at a time. method: a row of `ODOMETRY`. poses: known poses of the sensor, for method
+        "poses"; the map is then in their frame, as it is. n_scans: of the log where known, for the
+        progress. name: of the log in the progress.
+    """
+    # 1. where the sensor was at each turn; the frame is that of the sensor at the start
+    turns = _telling(read(), f"odometry of {name}", n_scans, progress)
+    answer = estimate(turns, method=method, poses=poses)
+    _require_some(answer, name)
+
+    # 2. every point at its place, deskewed; what lies in one voxel is kept once: (N, 3)
+    gathered = Accumulator(max_points=max_points)
+    turns = _telling(read(), f"map of {name}", n_scans, progress)
+    counted = _Counter(answer)
+    for cloud in georeference(counted.placeable(complete_scans(turns, [])), answer.trajectory):
+        gathered.add(cloud)
+    cloud = gathered.cloud()
+
+    # 3. level: upright things and the robot's attitude say where up is
+    progress(f"level the map of {name}")
+    levelling = no_levelling("the frame is that of the known poses")
+    if method != "poses":
+        levelling = level_log(cloud, answer.trajectory)
+    T = levelling.T_level_map
+    answer = _turned(answer, T)
+    notes = _notes(answer, levelling, counted.n_left_out)
+    return RobotMap(
+        move_cloud(T, cloud), answer.trajectory, answer, levelling, gathered.voxel,
+        counted.n, counted.n_left_out, notes,
+    )  # fmt: skip
+
+
+def move_cloud(T_a_b: Float64s, cloud: Cloud) -> Cloud:
+    """Return a cloud of frame b, with its ray origins, in frame a."""
+    origin = cloud.origin
+    if origin is not None:
+        origin = apply(T_a_b, origin).astype(np.float32)
+    return replace(cloud, xyz=apply(T_a_b, cloud.xyz), origin=origin)
+
+
+def move_trajectory(T_a_b: Float64s, trajectory: Trajectory) -> Trajectory:
+    """Return a trajectory of map frame b in map frame a."""
+    return Trajectory(trajectory.time, T_a_b @ trajectory.T_map_sensor)
+
+
+def describe_robot(robot: RobotMap, errors: TrajectoryErrors | None = None) -> dict[str, Any]:
+    """Return what is to be known of a robot's odometry as plain values, for JSON.
+
+    Directions are those of the robot's own map: shift along x, y, z and turn about x, y, z.
+    """
+    health = robot.odometry.health
+    values: dict[str, Any] = {
+        "method": robot.odometry.method,
+        "turns": robot.n_turns,
+        "way": robot.way,
+        "turns_lost": robot.odometry.n_lost,
+        "turns_degenerate": robot.odometry.n_degenerate,
+        "turns_left_out": robot.n_left_out,
+        "median_residual": float(np.nanmedian([h.residual for h in health]))
+        if any(np.isfinite(h.residual) for h in health)
+        else None,
+        "troubles": [
+            {
+                "kind": trouble.kind,
+                "begin": trouble.begin,
+                "end": trouble.end,
+                "turns": trouble.n,
+                "directions": trouble.directions.tolist(),
+            }
+            for trouble in robot.troubles
+        ],
+        "level": robot.levelling.reason,
+        "T_level_start": robot.levelling.T_level_map.tolist(),
+        "voxel": robot.voxel,
+        "points": len(robot.cloud.xyz),
+        "notes": list(robot.notes),
+    }
+    if errors is not None:
+        values["errors"] = {
+            "ape_rms": errors.ape,
+            "ape_max": errors.ape_max,
+            "relative_share": errors.relative,
+            "relative_radians_per_metre": errors.turn,
+            "stretch": errors.stretch,
+        }
+    return values
+
+
+def _telling(
+    scans: Iterable[Scan], step: str, n_scans: int | None, progress: Progress
+) -> Iterator[Scan]:
+    progress(step)
+    for number, scan in enumerate(scans):
+        yield scan
+        if n_scans and number % 20 == 19:
+            progress(step, min(1.0, (number + 1) / n_scans))
+
+
+class _Counter:
+    """Passes on the turns whose pose is known, and counts all and the others."""
+
+    def __init__(self, answer: Odometry):
+        self.n = self.n_left_out = 0
+        self._trajectory = answer.trajectory
+        self._lost = [h.lost for h in answer.health]
+
+    def placeable(self, scans: Iterable[Scan]) -> Iterator[Scan]:
+        for scan in scans:
+            lost = self.n < len(self._lost) and self._lost[self.n]
+            self.n += 1
+            if lost or not covers(self._trajectory, scan):
+                self.n_left_out += 1
+            else:
+                yield scan
+
+
+def _require_some(answer: Odometry, name: str) -> None:
+    if answer.n_lost > LOST_SHARE * max(len(answer.health), 1):
+        raise InputError(
+            f"odometry of {name} is lost in {answer.n_lost} of {len(answer.health)} turns: this "
+            "is no map; hand in poses that are known, if there are any (--odometry poses)"
+        )
+
+
+def _turned(answer: Odometry, T: Float64s) -> Odometry:
+    """Return the answer in a frame turned by T, its sentences on troubles told anew."""
+    told = set(describe_health(answer.health))
+    health = tuple(h.turned(T[:3, :3]) for h in answer.health)
+    notes = (*(n for n in answer.notes if n not in told), *describe_health(health))
+    return Odometry(answer.method, move_trajectory(T, answer.trajectory), health, notes)
+
+
+def _notes(answer: Odometry, levelling: Levelling, n_left_out: int) -> tuple[str, ...]:
+    notes = [*answer.notes]
+    if n_left_out:
+        notes.append(f"{n_left_out} turns whose poses are not known are left out of the map")
+    if answer.method != "poses":
+        notes.append(f"the map was {levelling.reason}" if levelling.tilt else levelling.reason)
+    return tuple(notes)
