@@ -220,6 +220,17 @@ def test_rules_by_hand(mode: str, expected: dict[tuple[int, int, int], float]) -
     assert [bool(merged.conflict[order[k]]) for k in (A, B, C)] == [True, False, False]
 
 
+def test_log_odds_of_zero_say_occupied() -> None:
+    zero, free = leaves_at([A, B], [0.0, 0.0]), leaves_at([A], [-0.5])
+    merged = merge(zero, [(free, np.eye(4))])
+    assert merged.conflict.tolist() == [True, False]
+    T = frames.from_xyz_yaw(0.1, 0.0, 0.0, 0.0)
+    moved = resample(zero, T, 0.1)
+    assert moved.occupied.all() and len(moved.depth) == 2
+    torn = merge(zero, [(leaves_at([A, B], [-0.5, 0.5]), np.eye(4))], mode="occupied-wins")
+    assert torn.leaves.log_odds.tolist() == [0.0, 0.5] and torn.leaves.occupied.all()
+
+
 def test_every_rule_is_tested() -> None:
     assert set(MERGE_RULES) == {"add", "keep-target", "occupied-wins"}
 

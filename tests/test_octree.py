@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from commonmap import frames
 from commonmap.errors import InputError
 from commonmap.io.morton import count_nodes, decode, encode, prune
 from commonmap.io.octomap import read_octree, read_octree_header, write_octree
+from commonmap.mapping import octree_kernels, octree_threads
 from commonmap.mapping.octree import Octree, log_odds, octree_from_points
 from commonmap.mapping.octree_blocks import blocks_to_leaves, leaves_to_blocks
 from commonmap.types import Leaves
@@ -273,9 +275,10 @@ def test_a_scan_that_spans_too_much_is_refused_with_a_sentence() -> None:
         ({"resolution": 0.0}, "resolution"),
         ({"resolution": 0.1, "hit": 0.4}, "hit"),
         ({"resolution": 0.1, "clamp_min": 0.6}, "clamp_min"),
+        ({"resolution": 0.1, "threads": 0}, "threads"),
     ],
 )
-def test_impossible_parameters_are_refused(kwargs: dict[str, float], word: str) -> None:
+def test_impossible_parameters_are_refused(kwargs: dict[str, Any], word: str) -> None:
     with pytest.raises(InputError, match=word):
         Octree(**kwargs)
 
@@ -351,6 +354,68 @@ def test_two_trees_of_one_input_give_the_same_bytes(tmp_path: Path) -> None:
         contents.append((tmp_path / name).read_bytes())
     assert contents[0] == contents[1]
     assert len(read_octree(tmp_path / "a.ot").depth) > 1000
+
+
+@pytest.mark.parametrize("threads", [2, 3])
+def test_any_number_of_threads_gives_the_same_bytes(tmp_path: Path, threads: int) -> None:
+    rng = np.random.default_rng(11)
+    one, many = Octree(0.1), Octree(0.1, threads=threads)
+    for k in range(4):
+        origin = np.array([0.5 * k, 0.2 * k, 1.5])
+        points = room_scan(origin, rng)
+        points[7] = np.nan
+        for tree in (one, many):
+            tree.insert(origin, points, max_range=20.0)
+            tree.insert(origin + np.zeros_like(points), points[::-1], max_range=5.0)
+            tree.insert((1e9, 0, 0), points[:3])
+            tree.insert(origin, points[:1])
+    write_octree(tmp_path / "one.ot", one.leaves())
+    write_octree(tmp_path / "many.ot", many.leaves())
+    assert (tmp_path / "one.ot").read_bytes() == (tmp_path / "many.ot").read_bytes()
+    assert one.count_nodes() > 100_000
+
+
+def test_threads_share_the_voxels_to_pass() -> None:
+    # ten rays: the first passes 92 voxels, the others 2; one far out and one from nowhere count 1
+    ends = np.full((12, 3), 0.5, np.float32)
+    ends[0, 0], ends[1:10, 0], ends[10, 0] = 91.5, 1.5, np.inf
+    starts = np.full((12, 3), 0.5, np.float32)
+    starts[11] = np.nan
+    state = np.zeros(12, np.uint8)
+    state[10] = octree_kernels.OUT
+    bounds = np.empty(3, np.int64)
+    octree_threads.share_rays(starts, ends, state, 1.0, bounds)
+    assert bounds.tolist() == [0, 1, 12]
+    octree_threads.share_rays(starts[::-1], ends[::-1], state[::-1], 1.0, bounds)
+    assert bounds.tolist() == [0, 12, 12]
+
+
+def test_log_odds_of_zero_are_occupied(tmp_path: Path) -> None:
+    # a hit of 0.6 and a miss of 0.4 cancel to the last bit
+    tree = Octree(1.0, hit=0.6, miss=0.4)
+    tree.update([[0.5, 0.5, 0.5]], occupied=True)
+    tree.update([[0.5, 0.5, 0.5]], occupied=False)
+    assert tree.log_odds_at([[0.5, 0.5, 0.5]]).tolist() == [0.0]
+    assert tree.leaves().occupied.tolist() == [True]
+    assert tree.cast_ray((0.5, 0.5, 0.5), (1, 0, 0)) is not None
+    write_octree(tmp_path / "a.bt", tree.leaves())
+    assert read_octree(tmp_path / "a.bt").log_odds[0] > 0
+
+
+@needs_pyoctomap
+def test_log_odds_of_zero_are_occupied_for_pyoctomap(tmp_path: Path) -> None:
+    import pyoctomap
+
+    tree, peer = Octree(0.1, hit=0.6, miss=0.4), pyoctomap.OcTree(0.1)
+    peer.setProbHit(0.6)
+    peer.setProbMiss(0.4)
+    for x in (0.05, 1.05):
+        for occupied in (True, False):
+            tree.update([[x, 0.05, 0.05]], occupied=occupied)
+            peer.updateNode(np.array([x, 0.05, 0.05]), occupied)
+    write_octree(tmp_path / "ours.bt", tree.leaves())
+    peer.writeBinary(str(tmp_path / "peer.bt"))
+    assert (tmp_path / "ours.bt").read_bytes() == (tmp_path / "peer.bt").read_bytes()
 
 
 def test_the_bits_of_a_scan_take_little_memory() -> None:

@@ -51,7 +51,7 @@ class Leaves:
     keys: (N, 3) uint16, key of the leaf's lower corner at the finest level:
         `key = floor(coordinate / resolution) + 32768`.
     depth: (N,) uint8, 16 for a smallest voxel; a leaf at depth d is `2**(16 - d)` voxels wide.
-    log_odds: (N,) float32; above 0 is occupied, else free.
+    log_odds: (N,) float32; 0 or above is occupied, below is free.
     """
 
     resolution: float
@@ -61,8 +61,8 @@ class Leaves:
 
     @property
     def occupied(self) -> Bools:
-        """(N,) bool: the leaf is more likely occupied than not."""
-        return self.log_odds > 0.0
+        """(N,) bool: the leaf is at least as likely occupied as not, as OctoMap decides."""
+        return self.log_odds >= 0.0
 
     def sizes(self) -> Float64s:
         """Return the edge of each leaf in metres, (N,)."""

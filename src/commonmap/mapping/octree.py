@@ -9,6 +9,8 @@ The tree is kept as blocks of 8^3 voxels behind a hash table and pruned when lea
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,10 +21,12 @@ from commonmap import frames
 from commonmap.errors import InputError
 from commonmap.io import morton
 from commonmap.mapping import octree_kernels as kernels
-from commonmap.mapping import octree_rays
+from commonmap.mapping import octree_rays, octree_threads
 from commonmap.mapping.octree_blocks import BLOCK, Blocks, leaves_of, leaves_to_blocks
 from commonmap.mapping.octree_scan import ScanBits
 from commonmap.types import KEY_ORIGIN, TREE_DEPTH, Bools, Float32s, Float64s, Leaves
+
+MAX_THREADS = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +45,8 @@ class Octree:
     stands for. clamp_min, clamp_max: probabilities that the occupancy is kept between. The frame is
     the map's; voxel keys run from 0 to 65535 and voxel 32768 begins at the origin, so that the tree
     reaches 32768 voxels each way, and what lies beyond is left out.
+
+    threads: how many work on a scan; the result is the same to the bit for any number.
     """
 
     def __init__(
@@ -51,6 +57,7 @@ class Octree:
         miss: float = 0.4,
         clamp_min: float = 0.1192,
         clamp_max: float = 0.971,
+        threads: int = 1,
     ) -> None:
         if not (math.isfinite(resolution) and resolution > 0):
             raise InputError(
@@ -66,6 +73,8 @@ class Octree:
                 "clamp_min must lie between 0 and 0.5 and clamp_max between 0.5 and 1;"
                 f" clamp_min={clamp_min} and clamp_max={clamp_max} came"
             )
+        if not 1 <= threads <= MAX_THREADS:
+            raise InputError(f"threads must be from 1 to {MAX_THREADS}; {threads} came")
         self.resolution = float(resolution)
         self.hit = log_odds(hit)
         self.miss = log_odds(miss)
@@ -76,12 +85,13 @@ class Octree:
         self._values = np.empty((16, BLOCK), np.float32)
         self._table_codes = np.full(64, -1, np.int64)
         self._table_slots = np.zeros(64, np.int32)
-        self._scratch = ScanBits()
+        self._scratch = [ScanBits() for _ in range(threads)]
+        self._pool = ThreadPoolExecutor(threads - 1) if threads > 1 else None
 
     @classmethod
-    def from_leaves(cls, leaves: Leaves, **options: float) -> Octree:
+    def from_leaves(cls, leaves: Leaves, *, threads: int = 1, **options: float) -> Octree:
         """Return an octree that holds what the leaves say. options: as of `Octree`."""
-        tree = cls(leaves.resolution, **options)
+        tree = cls(leaves.resolution, threads=threads, **options)
         tree._take(leaves_to_blocks(leaves))
         return tree
 
@@ -116,9 +126,7 @@ class Octree:
         box = kernels.clip(starts, ends, 1.0 / self.resolution, float(max_range), cut, state)
         if box[1, 0] < 0:
             return
-        self._scratch.open(box)
-        at = self._scratch.trace(starts, cut, state, self.resolution)
-        self._settle(at)
+        self._settle(self._trace(box, starts, cut, state))
 
     def insert_rays(self, origin: ArrayLike, points: ArrayLike, *, max_range: float = -1.0) -> None:
         """Insert rays one after the other, each its own measurement: OctoMap's `insertRay`.
@@ -167,7 +175,7 @@ class Octree:
     def memory_bytes(self) -> int:
         """Return the bytes of log-odds, hash table and scratch that this tree holds."""
         arrays = (self._codes, self._values, self._table_codes, self._table_slots)
-        return sum(a.nbytes for a in arrays) + self._scratch.memory_bytes()
+        return sum(a.nbytes for a in arrays) + sum(s.memory_bytes() for s in self._scratch)
 
     def log_odds_at(self, points: ArrayLike) -> Float32s:
         """Return the log-odds (N,) of the voxels of points (N, 3), NaN where unknown."""
@@ -258,16 +266,54 @@ class Octree:
         keys = morton.decode(np.unique(codes[inside]))
         return ((keys.astype(np.float64) - KEY_ORIGIN + 0.5) * self.resolution).astype(np.float32)
 
+    def _trace(
+        self,
+        box: NDArray[np.int64],
+        starts: Float32s,
+        ends: Float32s,
+        state: NDArray[np.uint8],
+    ) -> NDArray[np.int64]:
+        """Set the bits of one scan, each thread those of its rays; return the addresses of hits."""
+        scratch = self._scratch
+        for bits in scratch:
+            bits.open(box)
+        at = scratch[0].mark_ends(ends, state, self.resolution)
+        bounds = np.array([0, len(ends)])
+        if len(scratch) > 1:
+            bounds = np.empty(len(scratch) + 1, np.int64)
+            octree_threads.share_rays(starts, ends, state, 1.0 / self.resolution, bounds)
+        self._in_threads(
+            lambda part: scratch[part].trace(
+                starts, ends, state, self.resolution, int(bounds[part]), int(bounds[part + 1])
+            )
+        )
+        for other in scratch[1:]:
+            scratch[0].join(other)
+        return at
+
+    def _in_threads(self, work: Callable[[int], None]) -> None:
+        """Call `work` with the number of each thread, all at once; 0 is the calling thread."""
+        others = []
+        if self._pool is not None:
+            others = [self._pool.submit(work, part) for part in range(1, len(self._scratch))]
+        work(0)
+        for other in others:
+            other.result()
+
     def _settle(self, at: NDArray[np.int64]) -> None:
         """Bring the marks of one scan into the log-odds. at: (N,) addresses of hits, or -1."""
-        scratch = self._scratch
+        scratch = self._scratch[0]
         kernels.keep_ends(at, scratch.words)
         cubes, wanted = scratch.touched_cubes()
         slots = self._make_slots(wanted)
         limits = self.clamp_min, self.clamp_max
-        kernels.apply_misses(
-            cubes, slots, 0, len(cubes), scratch.words, self._values, self.miss, *limits
-        )
+        bounds = np.linspace(0, len(cubes), len(self._scratch) + 1).astype(np.int64)
+        self._in_threads(
+            lambda part: kernels.apply_misses(
+                cubes, slots, bounds[part], bounds[part + 1], scratch.words, self._values,
+                self.miss, *limits,
+            )
+        )  # fmt: skip
         scratch.slot_of[cubes] = slots
         kernels.apply_hits(at, scratch.slot_of, scratch.words, self._values, self.hit, *limits)
         scratch.close(cubes)

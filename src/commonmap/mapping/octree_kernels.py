@@ -8,6 +8,8 @@ How one scan goes in (`commonmap.mapping.octree.Octree.insert` calls these in tu
    lowest 15 bits are its Morton code inside the tile, the rest names the tile, and a step along one
    axis is one addition and two masks whatever borders it crosses. Nothing in the loop branches
    but its end.
+   With several threads each walks its share of the rays (`octree_threads`) over its own bits, and
+   the bits are joined: set in any order they are the same bits.
 3. `keep_ends` takes the bit of every end voxel away: a voxel with a hit is never freed by its scan.
 4. `locate` finds or makes the block of 8^3 log-odds behind each cube of bits that was touched.
 5. `apply_misses` and `apply_hits` add to the log-odds, once a voxel, and `forget` clears the bits.
@@ -100,7 +102,7 @@ def _dilate(k, low, axis, shift):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)  # type: ignore[misc]
-def _tile(here, table, tiles, n_tiles):  # type: ignore[no-untyped-def]
+def tile_of(here, table, tiles, n_tiles):  # type: ignore[no-untyped-def]
     """Return the tile of an address, a new one where there is none, and their number."""
     tile = np.int64(table[here >> 15])
     if tile < 0:
@@ -134,7 +136,7 @@ def mark_ends(  # type: ignore[no-untyped-def]
             | _dilate(key_of(ends[n, 1], factor), low[1], 1, shift_y)
             | _dilate(key_of(ends[n, 2], factor), low[2], 2, shift_z)
         )
-        tile, n_tiles = _tile(end, table, tiles, n_tiles)
+        tile, n_tiles = tile_of(end, table, tiles, n_tiles)
         touched[tile << 6 | (end >> 9) & 63] = 1
         at[n] = tile << 15 | end & 0x7FFF
     return ends.shape[0], n_tiles
@@ -395,7 +397,7 @@ def clear_blocks(values, first, last):  # type: ignore[no-untyped-def]
         values[slot] = np.float32(np.nan)
 
 
-@numba.njit(cache=True)  # type: ignore[misc]
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
 def apply_misses(cubes, slots, first, last, words, values, miss, low, high):  # type: ignore[no-untyped-def]
     """Add a miss to each voxel whose bit is set, clamped to low..high, in cubes first..last."""
     start = min(max(miss, low), high)

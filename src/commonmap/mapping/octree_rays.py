@@ -152,7 +152,7 @@ def cast(  # type: ignore[no-untyped-def]
             if table_codes[place] >= 0:
                 value = values[table_slots[place], code & 511]
             for a in range(3):
-                if first and value > 0:
+                if first and value >= 0:
                     end[n, a] = origin[a]
                 else:
                     end[n, a] = (np.float64(key[a] - KEY_ORIGIN) + 0.5) * resolution
@@ -162,7 +162,7 @@ def cast(  # type: ignore[no-untyped-def]
                     distance += np.float64((end[n, a] - origin[a]) * (end[n, a] - origin[a]))
                 if distance > max_range * max_range:
                     break
-            if value > 0:
+            if value >= 0:
                 hit[n] = True
                 break
             if value != value and not ignore_unknown:

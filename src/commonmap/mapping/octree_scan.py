@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from commonmap.errors import InputError
 from commonmap.mapping import octree_kernels as kernels
+from commonmap.mapping import octree_threads
 from commonmap.types import Float32s
 
 MAX_TABLE = 1 << 26
@@ -47,10 +48,10 @@ class ScanBits:
             self.table = np.full(size, -1, np.int32)
         self.n_tiles = 0
 
-    def trace(
-        self, starts: Float32s, ends: Float32s, state: NDArray[np.uint8], resolution: float
+    def mark_ends(
+        self, ends: Float32s, state: NDArray[np.uint8], resolution: float
     ) -> NDArray[np.int64]:
-        """Set the bits of all rays; return the address of each hit, or -1."""
+        """Return the address (N,) of each hit, or -1; its cube counts as touched."""
         at = np.empty(len(ends), np.int64)
         done = 0
         while done < len(ends):
@@ -60,15 +61,32 @@ class ScanBits:
             )  # fmt: skip
             if done < len(ends):
                 self._add_tiles(max(64, len(self.tiles) // 2))
-        done = 0
-        while done < len(ends):
+        return at
+
+    def trace(
+        self, starts: Float32s, ends: Float32s, state: NDArray[np.uint8], resolution: float,
+        first: int, last: int,
+    ) -> None:  # fmt: skip
+        """Set the bits of the rays first..last, the last not included."""
+        done = first
+        while done < last:
             done, self.n_tiles = kernels.trace(
-                done, len(ends), starts, ends, state, resolution, self.low, self.bits, self.table,
+                done, last, starts, ends, state, resolution, self.low, self.bits, self.table,
                 self.tiles, self.n_tiles, self.words, self.touched,
             )  # fmt: skip
-            if done < len(ends):
+            if done < last:
                 self._add_tiles(max(64, len(self.tiles) // 2))
-        return at
+
+    def join(self, other: ScanBits) -> None:
+        """Take over the bits of another with the same box, which is empty then."""
+        new = octree_threads.count_new_tiles(other.tiles, other.n_tiles, self.table)
+        if self.n_tiles + new > len(self.tiles):
+            self._add_tiles(self.n_tiles + new - len(self.tiles))
+        self.n_tiles = octree_threads.join_bits(
+            other.tiles, other.n_tiles, other.words, other.touched, other.table,
+            self.tiles, self.n_tiles, self.words, self.touched, self.table,
+        )  # fmt: skip
+        other.n_tiles = 0
 
     def touched_cubes(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the touched cubes, and the Morton code of the block behind each."""

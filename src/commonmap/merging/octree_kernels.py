@@ -102,10 +102,10 @@ def fill_by_volume(  # type: ignore[no-untyped-def]
                         if slot < 0:
                             continue
                         value = source[slot, _inside(kx) | _inside(ky) << 1 | _inside(kz) << 2]
-                        if value > 0:
+                        if value >= 0:
                             n_occupied += 1
                             sum_occupied += value
-                        elif value <= 0:
+                        elif value < 0:
                             n_free += 1
                             sum_free += value
             known = n_occupied + n_free
@@ -130,7 +130,7 @@ def keep_centres(  # type: ignore[no-untyped-def]
     for n in range(codes.shape[0]):
         x0, y0, z0 = 8 * gather(codes[n]), 8 * gather(codes[n] >> 1), 8 * gather(codes[n] >> 2)
         for v in range(512):
-            if not source[n, v] > 0:
+            if not source[n, v] >= 0:
                 continue
             x, y, z = x0 + gather(v) + 0.5, y0 + gather(v >> 1) + 0.5, z0 + gather(v >> 2) + 0.5
             kx = np.int64(np.floor(A[0, 0] * x + A[0, 1] * y + A[0, 2] * z + b[0]))
@@ -160,7 +160,7 @@ def accumulate(rows, values, robot, rule, total, seen):  # type: ignore[no-untyp
                 total[row, i] += value
             elif rule == LARGEST:
                 total[row, i] = value if before == 0 else max(total[row, i], value)
-            seen[row, i] = before | np.int64(1) << robot | (OCCUPIED if value > 0 else FREE)
+            seen[row, i] = before | np.int64(1) << robot | (OCCUPIED if value >= 0 else FREE)
 
 
 @numba.njit(cache=True)  # type: ignore[misc]
