@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from commonmap.matching.arrays import NUMPY
 from commonmap.matching.evidence import (
     Columns,
     SlabGrid,
@@ -203,11 +204,11 @@ def test_unpack_is_the_inverse_of_pack() -> None:
     rng = np.random.default_rng(5)
     occupied, known = random_slabs(rng, 32, (5, 7), shared=False)
     grid = packed(occupied, known)
-    slabs = np.arange(32, dtype=np.uint32)
-    out = unpack(grid.occupied, slabs, 8, 9)
-    assert np.array_equal(out[:, :5, :7], occupied.astype(np.float32))
-    assert out[:, 5:].sum() == 0 and out[:, :, 7:].sum() == 0
-    assert np.array_equal(unpack(grid.known, slabs, 5, 7), known.astype(np.float32))
+    for k in range(32):
+        layer = unpack(NUMPY, grid.occupied, k, np.float32)
+        assert layer.dtype == np.float32
+        assert np.array_equal(layer, occupied[k].astype(np.float32))
+        assert np.array_equal(unpack(NUMPY, grid.known, k, np.float64), known[k].astype(float))
 
 
 def test_coarse_cells_are_aligned_to_their_own_width() -> None:

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from commonmap.config import ComputeConfig
 from commonmap.mapping.ground import find_ground
 from commonmap.mapping.height_map import build_height_map
 from commonmap.matching.evidence import Columns, SlabGrid, list_columns, pack_slabs
@@ -15,12 +16,12 @@ from commonmap.matching.search import (
     SearchPlan,
     _climb_all,
     evidence_at,
-    local_maxima,
     plan_search,
     search,
     separate,
 )
 from commonmap.matching.search_metric import scatter_heights, search_metric
+from commonmap.matching.tiles import find_level, local_maxima
 from commonmap.types import Float64s, Floats, GridMap
 from matching_scenes import apart, look, make_place, moved, rigid
 
@@ -256,7 +257,9 @@ def test_climbing_never_goes_down() -> None:
     yaw = math.atan2(T[1, 0], T[0, 0])
     rng = np.random.default_rng(14)
     starts = np.column_stack([at + rng.normal(0, 0.4, (12, 2)), yaw + rng.normal(0, 0.03, 12)])
-    pose, score, _ = _climb_all(grid, columns, starts, 0.25, 0.02, 0.2, 1)
+    pose, score, _ = _climb_all(
+        find_level(grid, 1, ComputeConfig()), columns, starts, 0.25, 0.02, 0.2, 1
+    )
     for k in range(len(starts)):
         assert score[k] >= evidence_at(grid, columns, starts[k])[0] - 1e-6
         assert score[k] == pytest.approx(evidence_at(grid, columns, pose[k])[0], rel=1e-9)

@@ -116,6 +116,29 @@ class MergeConfig:
 
 
 @dataclass(frozen=True)
+class ComputeConfig:
+    """Where the search runs and what it may hold. The answer does not depend on it.
+
+    scheduler: address of a Dask scheduler, tcp://host:port; None: the threads of this machine.
+    memory_gb: what the exhaustive part of the search may hold at a time beside the maps, 1e9
+        bytes; on a cluster, in each thread of a worker.
+    arrays: "numpy", or "cupy" on a GPU.
+    """
+
+    scheduler: str | None = None
+    memory_gb: float = 0.5
+    arrays: Literal["numpy", "cupy"] = "numpy"
+
+    def __post_init__(self) -> None:
+        if self.scheduler is not None and "://" not in self.scheduler:
+            raise InputError(
+                f"compute.scheduler is an address like tcp://host:8786; {self.scheduler} came"
+            )
+        if not (math.isfinite(self.memory_gb) and self.memory_gb > 0):
+            raise InputError(f"compute.memory_gb must be positive; {self.memory_gb:g} came")
+
+
+@dataclass(frozen=True)
 class Config:
     """The whole tree, in the order of the pipeline. seed: enters wherever chance does."""
 
@@ -125,6 +148,7 @@ class Config:
     refine: RefineConfig = field(default_factory=RefineConfig)
     decide: DecideConfig = field(default_factory=DecideConfig)
     merge: MergeConfig = field(default_factory=MergeConfig)
+    compute: ComputeConfig = field(default_factory=ComputeConfig)
     seed: int = 0
 
     def __post_init__(self) -> None:

@@ -13,6 +13,7 @@ The transforms run on NumPy or, where the target was transformed on it, on CuPy.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -318,7 +319,7 @@ def evidence_surface(
             _add_evidence(*counts, table, total)
         else:
             _add_evidence_on_device(arrays.xp, *counts, table, total)
-    score = arrays.xp.where(overlap >= min_overlap, total, -np.inf).astype(np.float32)
+    score = arrays.xp.where(overlap >= math.ceil(min_overlap), total, -np.inf).astype(np.float32)
     return arrays.to_host(score), arrays.to_host(overlap.astype(np.float32))
 
 
@@ -367,6 +368,55 @@ def _add_evidence_on_device(
     total += (2.0 * agrees - 1.0) * g * varies
 
 
+def _spread_table() -> NDArray[np.uint64]:
+    """Return for each byte its bits, one in each byte of a word: eight counters in one addition."""
+    bits = np.arange(256, dtype=np.uint64)
+    lanes = [((bits >> np.uint64(k)) & np.uint64(1)) << np.uint64(8 * k) for k in range(8)]
+    return np.asarray(np.bitwise_or.reduce(np.stack(lanes), axis=0))
+
+
+SPREAD = _spread_table()
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _count_bits(  # type: ignore[no-untyped-def]
+    occupied, known, t_occupied, t_known, i0, j0, n_bytes, spread, lanes
+):
+    """Set lanes (4, 8 n_bytes) to the counts, per bit, of known, mine, other, and mine and other.
+
+    [0, 0] of the first two lies on [i0, j0] of the target. A lane of a word holds up to 255, so
+    the words are emptied after so many cells at most.
+    """
+    lanes[:] = 0
+    n_x, n_y = t_occupied.shape
+    side = known.shape[0]
+    words = np.zeros((4, n_bytes), np.uint64)
+    first, last = max(0, -j0), min(side, n_y - j0)
+    for a in range(max(0, -i0), min(side, n_x - i0)):
+        for start in range(first, last, 255):
+            words[:] = np.uint64(0)
+            hit = False
+            for b in range(start, min(start + 255, last)):
+                both = known[a, b] & t_known[a + i0, b + j0]
+                if both == 0:
+                    continue
+                hit = True
+                mine, other = occupied[a, b] & both, t_occupied[a + i0, b + j0] & both
+                for g in range(n_bytes):
+                    shift = 8 * g
+                    words[0, g] += spread[(both >> shift) & 255]
+                    words[1, g] += spread[(mine >> shift) & 255]
+                    words[2, g] += spread[(other >> shift) & 255]
+                    words[3, g] += spread[((mine & other) >> shift) & 255]
+            if not hit:
+                continue
+            for q in range(4):
+                for g in range(n_bytes):
+                    for k in range(8):
+                        lane = (words[q, g] >> np.uint64(8 * k)) & np.uint64(255)
+                        lanes[q, 8 * g + k] += np.int64(lane)
+
+
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
 def count_tables(  # type: ignore[no-untyped-def]
     t_occupied, t_known, origin, cell, xy, s_occupied, s_known, n_slabs, poses, first_i=0, first_j=0
@@ -381,6 +431,8 @@ def count_tables(  # type: ignore[no-untyped-def]
     cells this is what the FFT counts, and elsewhere what it would count on a shifted grid.
     """
     out = np.zeros((poses.shape[0], n_slabs, 4), np.int64)
+    lanes = np.zeros((4, 8 * ((n_slabs + 7) // 8)), np.int64)
+    spread = SPREAD
     n_x, n_y = t_occupied.shape
     reach = 0.0
     for n in range(xy.shape[0]):
@@ -401,17 +453,8 @@ def count_tables(  # type: ignore[no-untyped-def]
             if 0 <= i < n_x and 0 <= j < n_y:
                 occupied[i - i0, j - j0] |= s_occupied[n]
                 known[i - i0, j - j0] |= s_known[n]
-        for a in range(max(0, -i0), min(side, n_x - i0)):
-            for b in range(max(0, -j0), min(side, n_y - j0)):
-                both = known[a, b] & t_known[a + i0, b + j0]
-                if both == 0:
-                    continue
-                mine, other = occupied[a, b] & both, t_occupied[a + i0, b + j0] & both
-                for k in range(n_slabs):
-                    if (both >> k) & 1:
-                        m, o = (mine >> k) & 1, (other >> k) & 1
-                        out[p, k, 0] += 1
-                        out[p, k, 1] += m
-                        out[p, k, 2] += o
-                        out[p, k, 3] += m & o
+        _count_bits(occupied, known, t_occupied, t_known, i0, j0, (n_slabs + 7) // 8, spread, lanes)
+        for k in range(n_slabs):
+            for q in range(4):
+                out[p, k, q] = lanes[q, k]
     return out

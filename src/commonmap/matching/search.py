@@ -1,34 +1,35 @@
 """The search over x, y and yaw, full circle, without an initial guess.
 
-At a coarse cell every pose is scored exactly by FFT; the best separate peaks then descend through
-cells half as wide, each climbing to its local maximum. The mirrored source goes the same way in the
-same call: its best score is a draw of what chance alone reaches (the decoy).
+At a coarse cell every pose is scored exactly by FFT, tile by tile (`tiles.py`); the best separate
+peaks then descend through cells half as wide, each climbing to its local maximum. The mirrored
+source goes the same way in the same call: its best score is a draw of what chance alone reaches
+(the decoy).
 """
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 
 import numba
 import numpy as np
 
+from commonmap.config import ComputeConfig
 from commonmap.frames import from_xyz_yaw
 from commonmap.matching.evidence import (
     Columns,
     SlabGrid,
-    Spectra,
     coarsen,
     count_tables,
-    evidence_surface,
     list_columns,
-    scatter,
     signed_evidence,
-    transform_target,
     xlogx_table,
 )
+from commonmap.matching.tiles import Level, Sweep, find_level, plan_tiles, search_tiles
 from commonmap.types import Float64s, Progress, no_progress
+
+MOST_STEPS = 12
+"""Steps that a pose climbs on one cell at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,25 +96,28 @@ def search(
     plan: SearchPlan | None = None,
     n_peaks: int = 16,
     workers: int = 2,
+    compute: ComputeConfig | None = None,
     progress: Progress = no_progress,
 ) -> Peaks:
     """Return the best separate poses of `source` on `target`, both on half the finest cell.
 
     min_overlap: share of the source's known cells that must meet known cells of the target.
     mirrored: reflect the source (x -> -x about its centre) first; no true match exists then.
-    The answer is the same for any number of workers.
+    The answer is the same for any number of workers, and wherever and in whatever memory the
+    search runs. A large target may be mapped from a file: it is read in parts.
     """
     plan = plan or plan_search(target, source)
+    compute = compute or ComputeConfig()
     finest = 2.0 * target.cell
-    levels = [(cell, *_at_cell(target, source, cell)) for cell in plan.cells]
     centre = _centre(list_columns(source))
 
     # Every pose at the coarsest cell
-    cell, coarse_target, columns = levels[0]
-    columns = centre_columns(columns, centre, mirrored=mirrored)
+    cell = plan.cells[0]
+    columns = centre_columns(_columns_at(source, target, cell), centre, mirrored=mirrored)
+    level = find_level(target, round(cell / target.cell), compute)
     yaws = 2.0 * np.pi * np.arange(plan.n_yaw) / plan.n_yaw
     pose, score, per_yaw = _search_all(
-        coarse_target, columns, cell, yaws, min_overlap, workers, progress
+        level, columns, yaws, min_overlap, workers, compute, progress
     )
     order = separate(pose, score, 2.0 * cell, 3.0 * np.pi / plan.n_yaw, plan.keep[0])
     pose = pose[order]
@@ -121,14 +125,16 @@ def search(
     # Each candidate climbs at this cell, then at half of it, and so on
     step = 2.0 * np.pi / plan.n_yaw
     overlap = np.zeros(len(pose))
-    for level, (cell, grid, fine_columns) in enumerate(levels):
-        columns = centre_columns(fine_columns, centre, mirrored=mirrored)
+    for n, cell in enumerate(plan.cells):
+        if n > 0:
+            columns = centre_columns(_columns_at(source, target, cell), centre, mirrored=mirrored)
+            level = find_level(target, round(cell / target.cell), compute)
         yaw_step = step * cell / plan.cells[0] / 2.0
         pose, score, overlap = _climb_all(
-            grid, columns, pose, 0.5 * cell, yaw_step, min_overlap, workers
+            level, columns, pose, 0.5 * cell, yaw_step, min_overlap, workers
         )
-        last = level == len(levels) - 1
-        keep = n_peaks if last else plan.keep[level + 1]
+        last = n == len(plan.cells) - 1
+        keep = n_peaks if last else plan.keep[n + 1]
         apart = 2.0 * cell if not last else 4.0 * finest
         order = separate(pose, score, apart, (6.0 if last else 2.0) * yaw_step, keep)
         pose, score, overlap = pose[order], score[order], overlap[order]
@@ -149,10 +155,10 @@ def evidence_at(target: SlabGrid, columns: Columns, pose: Float64s) -> tuple[flo
     return float(total), int(table[:, 0].max())
 
 
-def _at_cell(target: SlabGrid, source: SlabGrid, cell: float) -> tuple[SlabGrid, Columns]:
-    """Return the target on `cell` and the source's columns on half of it: no holes when turned."""
+def _columns_at(source: SlabGrid, target: SlabGrid, cell: float) -> Columns:
+    """Return the source's columns on half of a level's cell: no holes when turned."""
     factor = round(cell / target.cell)
-    return coarsen(target, factor), list_columns(coarsen(source, max(1, factor // 2)))
+    return list_columns(coarsen(source, max(1, factor // 2)))
 
 
 def _centre(columns: Columns) -> Float64s:
@@ -179,99 +185,38 @@ def centre_columns(columns: Columns, centre: Float64s, *, mirrored: bool) -> Col
 
 
 def _search_all(
-    target: SlabGrid,
+    level: Level,
     columns: Columns,
-    cell: float,
     yaws: Float64s,
     min_overlap: float,
     workers: int,
+    compute: ComputeConfig,
     progress: Progress,
 ) -> tuple[Float64s, Float64s, Float64s]:
     """Return the separate peaks of every yaw: poses (M, 3), scores (M,), and (yaw, best) pairs."""
+    cell = level.cell
     reach = float(np.hypot(*columns.xy.T).max())
     side = 2 * int(np.ceil(reach / cell)) + 2
     low = np.full(2, -0.5 * side * cell)
-    spectra = transform_target(target, (side, side), workers=workers)
-    n_known = _known_cells(columns, cell)
-    one = partial(
-        _search_yaw,
-        target=target,
-        spectra=spectra,
-        columns=columns,
-        cell=cell,
-        low=low,
-        side=side,
-        min_pairs=min_overlap * n_known,
+    min_pairs = min_overlap * _known_cells(columns, cell)
+    sweep = Sweep(columns, cell, low, side, yaws, min_pairs, compute.arrays)
+    at_once = workers if compute.scheduler is None else 1
+    plan = plan_tiles(level.shape, side, columns.n_slabs, compute=compute, workers=at_once)
+    found = search_tiles(
+        level, sweep, plan.tiles, compute=compute, workers=workers, progress=progress
     )
-    found = []
-    with ThreadPoolExecutor(max_workers=workers) as pool:
-        for n, peaks in enumerate(pool.map(one, yaws)):
-            found.append(peaks)
-            progress("search", (n + 1) / len(yaws))
-    pose = np.concatenate([f[:, :3] for f in found])
-    score = np.concatenate([f[:, 3] for f in found])
-    best = np.array([f[:, 3].max(initial=-np.inf) for f in found])
-    return pose, score, np.column_stack([yaws, best])
+    # translation [u, v] lays the source's point (0, 0) here
+    at = [level.origin + (f[:, :2] - (side - 1)) * cell - low for f in found]
+    yaw = np.repeat(yaws, [len(f) for f in found])
+    best = np.array([f[:, 2].max(initial=-np.inf) for f in found])
+    pose = np.column_stack([np.concatenate(at), yaw])
+    return pose, np.concatenate(found)[:, 2], np.column_stack([yaws, best])
 
 
 def _known_cells(columns: Columns, cell: float) -> int:
     """Return how many cells of that width the source knows, unturned."""
     cells = np.floor(columns.xy / cell).astype(np.int64)
     return len(np.unique(cells[:, 0] * (1 << 32) + cells[:, 1]))
-
-
-def _search_yaw(
-    yaw: float,
-    *,
-    target: SlabGrid,
-    spectra: Spectra,
-    columns: Columns,
-    cell: float,
-    low: Float64s,
-    side: int,
-    min_pairs: float,
-    n_peaks: int = 6,
-) -> Float64s:
-    """Return the best separate translations at one yaw, (n, 4) x, y, yaw, score."""
-    occupied, known = scatter(
-        columns.xy, columns.occupied, columns.known,
-        float(np.cos(yaw)), float(np.sin(yaw)), cell, low, side, side,
-    )  # fmt: skip
-    score, _ = evidence_surface(spectra, occupied, known, min_overlap=min_pairs, workers=1)
-    index = local_maxima(score, n_peaks, 0.0)
-    index = index[index[:, 0] >= 0]
-    xy = target.origin + (index - (side - 1)) * cell - low
-    values = score[index[:, 0], index[:, 1]].astype(np.float64)
-    return np.column_stack([xy, np.full(len(xy), yaw), values])
-
-
-@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
-def local_maxima(score, n_peaks, above):  # type: ignore[no-untyped-def]
-    """Return the indices (n_peaks, 2) of the highest 3x3 local maxima over `above`, else -1."""
-    index = np.full((n_peaks, 2), -1, np.int64)
-    value = np.full(n_peaks, -np.inf)
-    n_u, n_v = score.shape
-    for u in range(n_u):
-        for v in range(n_v):
-            s = score[u, v]
-            if not s > value[-1] or s <= above:
-                continue
-            peak = True
-            for a in range(max(u - 1, 0), min(u + 2, n_u)):
-                for b in range(max(v - 1, 0), min(v + 2, n_v)):
-                    earlier = a < u or (a == u and b < v)
-                    if score[a, b] > s or (earlier and score[a, b] == s):
-                        peak = False
-            if not peak:
-                continue
-            place = n_peaks - 1
-            while place > 0 and s > value[place - 1]:
-                value[place] = value[place - 1]
-                index[place] = index[place - 1]
-                place -= 1
-            value[place] = s
-            index[place, 0], index[place, 1] = u, v
-    return index
 
 
 def separate(
@@ -294,7 +239,7 @@ def separate(
 
 
 def _climb_all(
-    target: SlabGrid,
+    level: Level,
     columns: Columns,
     pose: Float64s,
     step: float,
@@ -302,17 +247,22 @@ def _climb_all(
     min_overlap: float,
     workers: int,
 ) -> tuple[Float64s, Float64s, Float64s]:
-    """Return every pose moved to its local maximum on this grid, with score and overlap."""
-    n_known = _known_cells(columns, target.cell)
+    """Return every pose moved to its local maximum on this level, with score and overlap."""
+    n_known = _known_cells(columns, level.cell)
     table = xlogx_table(2 * n_known + 64)
-    blocks = np.array_split(np.arange(len(pose)), max(1, min(len(pose), 4 * workers)))
+    reach = float(np.hypot(*columns.xy.T).max()) + MOST_STEPS * step
+    n_blocks = min(len(pose), 4 * workers) if level.whole is not None else len(pose)
+    blocks = np.array_split(np.arange(len(pose)), max(1, n_blocks))
 
     def climb(block: np.ndarray[tuple[int], np.dtype[np.int64]]) -> Float64s:
+        if len(block) == 0:
+            return np.zeros((0, 5))
+        window, first_i, first_j = level.around(pose[block], reach)
         return np.asarray(
             _climb(
-                target.occupied, target.known, target.origin, target.cell, columns.xy,
+                window.occupied, window.known, level.origin, level.cell, columns.xy,
                 columns.occupied, columns.known, columns.n_slabs, pose[block], step, yaw_step,
-                min_overlap * n_known, table,
+                min_overlap * n_known, table, first_i, first_j,
             )
         )  # fmt: skip
 
@@ -324,28 +274,48 @@ def _climb_all(
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
 def _climb(  # type: ignore[no-untyped-def]
     t_occupied, t_known, origin, cell, xy, s_occupied, s_known, n_slabs, poses, step, yaw_step,
-    min_pairs, xlogx,
+    min_pairs, xlogx, first_i, first_j,
 ):  # fmt: skip
-    """Return (P, 5) x, y, yaw, score, pairs after climbing in steps of `step` and `yaw_step`."""
+    """Return (P, 5) x, y, yaw, score, pairs after climbing in steps of `step` and `yaw_step`.
+
+    A climb walks on a lattice about where it starts; a node is counted once.
+    """
     out = np.empty((poses.shape[0], 5))
-    trial = np.empty((27, 3))
+    size = 2 * MOST_STEPS + 1
     for p in range(poses.shape[0]):
+        seen = np.zeros((size, size, size), np.bool_)
+        trial, node = np.empty((27, 3)), np.empty((27, 3), np.int64)
+        at = np.full(3, MOST_STEPS)
         pose = poses[p].copy()
         best, pairs = -np.inf, 0.0
-        for _ in range(12):
-            m = 0
-            for a in range(-1, 2):
-                for b in range(-1, 2):
-                    for c in range(-1, 2):
-                        trial[m, 0] = pose[0] + a * step
-                        trial[m, 1] = pose[1] + b * step
-                        trial[m, 2] = pose[2] + c * yaw_step
-                        m += 1
+        for _ in range(MOST_STEPS):
+            n_trials = 0
+            for a in range(at[0] - 1, at[0] + 2):
+                for b in range(at[1] - 1, at[1] + 2):
+                    for c in range(at[2] - 1, at[2] + 2):
+                        if seen[a, b, c]:
+                            continue
+                        seen[a, b, c] = True
+                        node[n_trials, 0], node[n_trials, 1], node[n_trials, 2] = a, b, c
+                        trial[n_trials, 0] = poses[p, 0] + (a - MOST_STEPS) * step
+                        trial[n_trials, 1] = poses[p, 1] + (b - MOST_STEPS) * step
+                        trial[n_trials, 2] = poses[p, 2] + (c - MOST_STEPS) * yaw_step
+                        n_trials += 1
             tables = count_tables(
-                t_occupied, t_known, origin, cell, xy, s_occupied, s_known, n_slabs, trial
+                t_occupied,
+                t_known,
+                origin,
+                cell,
+                xy,
+                s_occupied,
+                s_known,
+                n_slabs,
+                trial[:n_trials],
+                first_i,
+                first_j,
             )
             winner = -1
-            for m in range(27):
+            for m in range(n_trials):
                 most = 0
                 total = 0.0
                 for k in range(n_slabs):
@@ -357,9 +327,8 @@ def _climb(  # type: ignore[no-untyped-def]
                 if total > best + 1e-9:
                     best, winner, pairs = total, m, float(most)
             if winner < 0:
-                break
-            pose = trial[winner].copy()
-            if winner == 13:
-                break
+                break  # nothing about is better
+            at[:] = node[winner]
+            pose[:] = trial[winner]
         out[p, :3], out[p, 3], out[p, 4] = pose, best, pairs
     return out

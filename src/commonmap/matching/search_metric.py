@@ -13,7 +13,8 @@ import numba
 import numpy as np
 
 from commonmap.matching import correlate
-from commonmap.matching.search import Peaks, count_yaws, local_maxima, separate
+from commonmap.matching.search import Peaks, count_yaws, separate
+from commonmap.matching.tiles import N_PEAKS, local_maxima
 from commonmap.metrics.plans import DifferenceSum, JointHistogram, MinSum, Smooth
 from commonmap.metrics.table import find_metric
 from commonmap.types import Float64s, GridMap, Progress, no_progress
@@ -126,7 +127,7 @@ def _search_yaw(
     surface = correlate.score_surface(prepared, turned, known, workers=1)
     gain = -prepared.metric.cost(surface.score)
     score = np.where(np.isfinite(gain), gain, -np.inf).astype(np.float64)
-    index = local_maxima(score, 6, -np.inf)
+    index = local_maxima(score, N_PEAKS, -np.inf)
     index = index[index[:, 0] >= 0]
     where = origin + (index - (side - 1)) * cell - low
     values = score[index[:, 0], index[:, 1]]
