@@ -1,18 +1,29 @@
-"""Insertion of VLP-16 scans: our octree against pyoctomap (OctoMap's C++), in one run, one thread.
+# ruff: noqa: E402 (threads are limited before numpy loads)
+"""Insertion of VLP-16 scans: our octree against pyoctomap (OctoMap's C++), in one run.
 
-    python benchmarks/octree.py                      # everything, about ten minutes
+    python benchmarks/octree.py                      # everything, three quarters of an hour
     python benchmarks/octree.py --scans 20 --peer-seconds 10
+    python benchmarks/octree.py --stream             # a log mapped as it comes, odometry included
 
-Both take the same scans one after the other, turn by turn; times are CPU time of the one thread.
-The peer stops when its budget is spent; the ratio is over the scans that both did, and the files
-of both trees are compared byte for byte there. Raw times go to `benchmarks/records/octree.json`.
+Each tree takes the same scans in a process of its own: pyoctomap, ours on one thread, ours on two.
+Ratios are of the CPU time of one thread. Two threads are told by wall time, which other jobs on the
+machine lengthen, and by the CPU time of the thread that does most, which they do not. Files are
+compared by their SHA-256. Where `--peer-seconds` stops the peer early, ratio and files are of the
+scans that it did. Peaks are by how much the peak of resident memory grows over all scans, and over
+writing the file. Raw times go to `benchmarks/records/octree.json`.
+
+`--stream`: turns of a VLP-16 on a simulated drive go one by one through LOAM, and each, deskewed,
+into the octree as soon as its pose is final; all on one thread.
 """
 
 from __future__ import annotations
 
 import argparse
+import ctypes
 import gc
+import hashlib
 import json
+import os
 import platform
 import subprocess
 import sys
@@ -22,6 +33,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
+    os.environ.setdefault(name, "1")
+
 import numpy as np
 
 RECORDS = Path(__file__).parent / "records"
@@ -29,6 +43,8 @@ RESOLUTIONS = (0.4, 0.2, 0.1)
 MAX_RANGE = 50.0
 N_POINTS = 30_000
 SEED = 20
+TURN = 0.1
+"""Seconds a turn of the lidar takes."""
 
 
 class Yard:
@@ -95,95 +111,140 @@ def count_steps(origin: np.ndarray, points: np.ndarray, resolution: float) -> in
     return int(crossed.sum())
 
 
-def time_insertion(resolution: float, n: int, peer_seconds: float) -> dict[str, Any]:
-    """Insert the scans into both trees; return raw seconds per scan and what came of it."""
-    import pyoctomap
+class Ours:
+    """Our octree. threads: how many work on a scan."""
 
-    from commonmap.io.octomap import write_octree
-    from commonmap.mapping.octree import Octree
+    def __init__(self, resolution: float, threads: int) -> None:
+        from commonmap.mapping.octree import Octree
 
-    warm = Octree(resolution)
-    warm.insert((0, 0, 0), np.ones((2, 3)), max_range=MAX_RANGE)
-    warm.leaves()
-    ours, peer = Octree(resolution), pyoctomap.OcTree(resolution)
-    seconds: dict[str, list[float]] = {"ours": [], "peer": []}
-    steps = 0
-    identical = None
-    for origin, points in scans(n):
-        start = time.thread_time()
-        ours.insert(origin, points, max_range=MAX_RANGE)
-        seconds["ours"].append(time.thread_time() - start)
-        steps += count_steps(origin, points, resolution)
-        if identical is not None:
-            continue
-        points64, origin64 = points.astype(float), origin.astype(float)
-        start = time.thread_time()
-        peer.insertPointCloud(points64, origin64, MAX_RANGE)
-        seconds["peer"].append(time.thread_time() - start)
-        if sum(seconds["peer"]) > peer_seconds or len(seconds["peer"]) == n:
-            with tempfile.TemporaryDirectory() as folder:
-                start = time.thread_time()
-                write_octree(Path(folder) / "ours.ot", ours.leaves())
-                write_seconds = time.thread_time() - start
-                peer.write(f"{folder}/peer.ot")
-                contents = [(Path(folder) / f"{k}.ot").read_bytes() for k in ("ours", "peer")]
-            identical = contents[0] == contents[1]
-            n_bytes = len(contents[0])
-    both = len(seconds["peer"])
+        warm = Octree(resolution, threads=threads)  # loads the kernels
+        warm.insert((0, 0, 0), np.ones((2, 3)), max_range=MAX_RANGE)
+        warm.leaves()
+        self.tree = Octree(resolution, threads=threads)
+
+    def insert(self, origin: np.ndarray, points: np.ndarray) -> None:
+        self.tree.insert(origin, points, max_range=MAX_RANGE)
+
+    def write(self, path: Path) -> None:
+        from commonmap.io.octomap import write_octree
+
+        write_octree(path, self.tree.leaves())
+
+    def figures(self) -> dict[str, Any]:
+        """Return what the tree says of itself."""
+        return {"memory_bytes": self.tree.memory_bytes()}
+
+
+class Peer:
+    """pyoctomap's OcTree with its defaults, which are ours; it takes float64."""
+
+    def __init__(self, resolution: float) -> None:
+        import pyoctomap
+
+        self.tree = pyoctomap.OcTree(resolution)
+
+    def insert(self, origin: np.ndarray, points: np.ndarray) -> None:
+        self.tree.insertPointCloud(points, origin, MAX_RANGE)
+
+    def write(self, path: Path) -> None:
+        self.tree.write(str(path))
+
+    def figures(self) -> dict[str, Any]:
+        """Return what the tree says of itself."""
+        return {"memory_bytes": self.tree.memoryUsage()}
+
+
+def run_child(which: str, resolution: float, n: int, budget: float) -> None:
+    """Insert up to n scans into one tree and print the raw figures as JSON."""
+    work = list(scans(n))
+    kind = np.float64 if which == "peer" else np.float32
+    tree = Peer(resolution) if which == "peer" else Ours(resolution, int(which))
+    gc.collect()
+    ctypes.CDLL(None).malloc_trim(0)  # what was freed counts as memory again when it is taken
+    Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
+    before = _peak_mb()
+    cpu: list[float] = []
+    wall: list[float] = []
+    for origin, points in work:
+        origin, points = origin.astype(kind), points.astype(kind)
+        start, cpu_start = time.perf_counter(), time.thread_time()
+        tree.insert(origin, points)
+        cpu.append(time.thread_time() - cpu_start)
+        wall.append(time.perf_counter() - start)
+        if sum(cpu) > budget:
+            break
+    peak = _peak_mb() - before
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.perf_counter()
+        tree.write(Path(folder) / "map.ot")
+        write_seconds = time.perf_counter() - start
+        content = (Path(folder) / "map.ot").read_bytes()
+    figures = {
+        "scans": len(cpu),
+        "cpu_seconds": cpu,
+        "wall_seconds": wall,
+        "peak_mb": peak,
+        "peak_mb_written": _peak_mb() - before,
+        "write_seconds": write_seconds,
+        "file_bytes": len(content),
+        "sha256": hashlib.sha256(content).hexdigest(),
+        **tree.figures(),
+    }
+    print(json.dumps(figures))
+
+
+def in_child(which: str, resolution: float, n: int, budget: float = np.inf) -> dict[str, Any]:
+    """Return the figures of `run_child`, run in a process of its own."""
+    command = [sys.executable, __file__, "--child", which, str(resolution), str(n), str(budget)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    figures: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return figures | {"load": os.getloadavg()[0]}
+
+
+def compare(resolution: float, n: int, peer_seconds: float, bandwidth: float) -> dict[str, Any]:
+    """Return the row of one resolution: raw figures of each tree, and what follows of them."""
+    peer = in_child("peer", resolution, n, peer_seconds)
+    both = peer["scans"]
+    one, two = in_child("1", resolution, n), in_child("2", resolution, n)
+    again = one if both == n else in_child("1", resolution, both)
+    steps = [count_steps(*scan, resolution) for scan in scans(n)]
+    speed = sum(steps) / sum(one["cpu_seconds"])
     return {
         "resolution": resolution,
-        "n_scans": n,
-        "n_scans_of_both": both,
-        "ratio": sum(seconds["peer"]) / sum(seconds["ours"][:both]),
-        "ours_ms": 1e3 * float(np.mean(seconds["ours"])),
-        "ours_ms_of_both": 1e3 * float(np.mean(seconds["ours"][:both])),
-        "peer_ms": 1e3 * float(np.mean(seconds["peer"])),
-        "identical_files": identical,
-        "file_bytes": n_bytes,
-        "write_seconds": write_seconds,
-        "steps_per_scan": steps / n,
-        "steps_per_second": steps / sum(seconds["ours"]),
-        "ours_memory_bytes": ours.memory_bytes(),
-        "seconds": seconds,
+        "scans": n,
+        "scans_of_both": both,
+        "ratio": sum(peer["cpu_seconds"]) / sum(one["cpu_seconds"][:both]),
+        "identical_files": peer["sha256"] == again["sha256"],
+        "identical_files_of_two_threads": one["sha256"] == two["sha256"],
+        "two_threads_wall": float(np.median(np.divide(one["wall_seconds"], two["wall_seconds"]))),
+        "two_threads_cpu": sum(one["cpu_seconds"]) / sum(two["cpu_seconds"]),
+        "steps_per_scan": sum(steps) / n,
+        "steps_per_second": speed,
+        "share_of_bandwidth": speed * 8.0 / bandwidth,
+        "peer": peer,
+        "one_thread": one,
+        "two_threads": two,
     }
 
 
-def peak_memory(resolution: float, n: int, which: str) -> float:
-    """Return the MB by which the peak of a process of its own grows while it inserts n scans."""
-    command = [sys.executable, __file__, "--child", which, str(resolution), str(n)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    return float(done.stdout.split()[-1])
+def say(row: dict[str, Any]) -> None:
+    """Print one row of the table."""
+    ms = {k: 1e3 * float(np.mean(row[k]["cpu_seconds"])) for k in ("peer", "one_thread")}
+    same = row["identical_files"] and row["identical_files_of_two_threads"]
+    peaks = ", ".join(f"{row[k]['peak_mb']:.0f}" for k in ("peer", "one_thread", "two_threads"))
+    print(
+        f"{row['resolution']} | {row['scans_of_both']} | {ms['peer']:.0f} |"
+        f" {ms['one_thread']:.1f} | {row['ratio']:.1f} | {row['two_threads_wall']:.2f},"
+        f" {row['two_threads_cpu']:.2f} | {same} | {row['steps_per_second'] / 1e6:.0f}"
+        f" ({100 * row['share_of_bandwidth']:.1f} %) | {peaks}",
+        flush=True,
+    )
 
 
-def run_child(which: str, resolution: float, n: int) -> None:
-    """Insert n scans into one tree and print the gain of the peak in MB."""
-    work = list(scans(n))
-    tree: Any
-    if which == "ours":
-        from commonmap.mapping.octree import Octree
-
-        Octree(resolution).insert(*work[0], max_range=MAX_RANGE)  # loads the kernels
-        tree = Octree(resolution)
-    else:
-        import pyoctomap
-
-        tree = pyoctomap.OcTree(resolution)
-        work = [(o.astype(float), p.astype(float)) for o, p in work]
-    gc.collect()
-    Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
-    before = _peak_kb()
-    for origin, points in work:
-        if which == "ours":
-            tree.insert(origin, points, max_range=MAX_RANGE)
-        else:
-            tree.insertPointCloud(points, origin, MAX_RANGE)
-    print((_peak_kb() - before) / 1e3)
-
-
-def _peak_kb() -> int:
-    """Return the peak resident memory of this process since it began (Linux), kB."""
+def _peak_mb() -> float:
+    """Return the peak resident memory of this process since it began anew (Linux), MB."""
     status = Path("/proc/self/status").read_text().splitlines()
-    return int(next(line for line in status if line.startswith("VmHWM")).split()[1])
+    return int(next(line for line in status if line.startswith("VmHWM")).split()[1]) / 1e3
 
 
 def copy_bandwidth() -> float:
@@ -198,36 +259,96 @@ def copy_bandwidth() -> float:
     return 2 * a.nbytes / best
 
 
+def map_stream(world_kind: str, seconds: float, resolution: float) -> dict[str, Any]:
+    """Return CPU seconds a turn of odometry and of mapping over a simulated drive."""
+    from commonmap.mapping.octree import Octree
+    from commonmap.odometry import georeference
+    from commonmap.odometry.loam import Loam
+    from commonmap.sim.missions import Area, drive
+    from commonmap.sim.scanning import RayCaster, scan_world, split_scans, turn_stamps
+    from commonmap.sim.vlp16 import find_lidar
+    from commonmap.sim.worlds import build_world
+    from commonmap.types import Trajectory
+
+    rng = np.random.default_rng(SEED)
+    world = build_world(world_kind, rng)
+    mission = drive(world, Area(0.0, 0.0, 0.7 * world.size, 0.7 * world.size), rng)
+    lidar = find_lidar("vlp16")
+    stamps = turn_stamps(mission.sensor, lidar)[: int(seconds / TURN)]
+    turns = []
+    for part in np.array_split(stamps, max(1, len(stamps) // 50)):
+        seen = scan_world(RayCaster(world), mission.sensor, lidar, part, rng=rng)
+        turns += split_scans(seen, part)
+    loam, tree = Loam(), Octree(resolution)
+    odometry: list[float] = []
+    mapping: list[float] = []
+    for k, turn in enumerate(turns):
+        start = time.thread_time()
+        loam.add(turn)
+        odometry.append(time.thread_time() - start)
+        if k == 0:
+            continue
+        start = time.thread_time()
+        last = slice(max(0, k - 2), k + 1)
+        known = Trajectory(np.array(loam.moments[last]), np.array(loam.poses[last]))
+        for cloud in georeference([turns[k - 1]], known):
+            assert cloud.origin is not None
+            tree.insert(cloud.origin, cloud.xyz, max_range=MAX_RANGE)
+        mapping.append(time.thread_time() - start)
+    return {
+        "world": world_kind,
+        "resolution": resolution,
+        "turns": len(turns),
+        "points_per_turn": float(np.mean([len(t.xyz) for t in turns])),
+        "odometry_seconds": odometry,
+        "mapping_seconds": mapping,
+        "share_of_one_core": (sum(odometry) + sum(mapping)) / (TURN * len(turns)),
+        "load": os.getloadavg()[0],
+    }
+
+
+def say_stream(row: dict[str, Any]) -> None:
+    """Print one row of the stream's table."""
+    ms = [1e3 * np.array(row[k]) for k in ("odometry_seconds", "mapping_seconds")]
+    both = ms[0][1:] + ms[1]
+    print(
+        f"{row['world']} | {row['turns']} | {row['points_per_turn']:.0f} | {ms[0].mean():.1f} |"
+        f" {ms[1].mean():.1f} | {np.percentile(both, 99):.1f} | {row['share_of_one_core']:.2f}",
+        flush=True,
+    )
+
+
 def main() -> None:
     """Run and print a table; write the raw record."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--scans", type=int, default=200)
-    parser.add_argument("--peer-seconds", type=float, default=120.0, help="per resolution")
-    parser.add_argument("--memory-scans", type=int, default=20)
+    parser.add_argument("--peer-seconds", type=float, default=np.inf, help="per resolution")
     parser.add_argument("--resolution", type=float, nargs="*", default=list(RESOLUTIONS))
-    parser.add_argument("--record", type=Path, default=RECORDS / "octree.json")
-    parser.add_argument("--child", nargs=3, help=argparse.SUPPRESS)
+    parser.add_argument("--stream", action="store_true", help="the stream instead")
+    parser.add_argument("--worlds", nargs="*", default=["paper", "city", "forest"])
+    parser.add_argument("--stream-seconds", type=float, default=60.0)
+    parser.add_argument("--record", type=Path, help="where the raw record goes")
+    parser.add_argument("--child", nargs=4, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.child:
-        run_child(args.child[0], float(args.child[1]), int(args.child[2]))
+        which, resolution, n, budget = args.child
+        run_child(which, float(resolution), int(n), float(budget))
         return
     rows = []
-    print(
-        "voxel m | scans (both) | peer ms | ours ms | ratio | identical | Msteps/s"
-        " | peak MB peer, ours"
-    )
-    for resolution in args.resolution:
-        row = time_insertion(resolution, args.scans, args.peer_seconds)
-        for which in ("peer", "ours"):
-            row[f"{which}_peak_mb"] = peak_memory(resolution, args.memory_scans, which)
-        rows.append(row)
+    bandwidth = copy_bandwidth()
+    if args.stream:
+        print("world | turns | points | odometry ms | mapping ms | both, 99 % | share of a core")
+        for world in args.worlds:
+            rows.append(map_stream(world, args.stream_seconds, 0.2))
+            say_stream(rows[-1])
+    else:
         print(
-            f"{resolution} | {args.scans} ({row['n_scans_of_both']}) | {row['peer_ms']:.0f} |"
-            f" {row['ours_ms_of_both']:.1f} | {row['ratio']:.1f} | {row['identical_files']} |"
-            f" {row['steps_per_second'] / 1e6:.0f} |"
-            f" {row['peer_peak_mb']:.0f}, {row['ours_peak_mb']:.0f}",
-            flush=True,
+            "voxel m | scans | peer ms | ours ms | ratio | two threads: wall, CPU | identical"
+            " | Msteps/s (of bandwidth) | peak MB: peer, ours on one, on two"
         )
+        for resolution in args.resolution:
+            rows.append(compare(resolution, args.scans, args.peer_seconds, bandwidth))
+            say(rows[-1])
     record = {
         "machine": platform.processor() or platform.machine(),
         "python": platform.python_version(),
@@ -235,12 +356,12 @@ def main() -> None:
         "peer": "pyoctomap " + __import__("pyoctomap").__version__,
         "max_range": MAX_RANGE,
         "points_per_scan": N_POINTS // 16 * 16,
-        "copy_bytes_per_second": copy_bandwidth(),
-        "memory_scans": args.memory_scans,
+        "copy_bytes_per_second": bandwidth,
         "rows": rows,
     }
-    args.record.parent.mkdir(parents=True, exist_ok=True)
-    args.record.write_text(json.dumps(record, indent=1) + "\n")
+    path = args.record or RECORDS / ("octree_stream.json" if args.stream else "octree.json")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(record, indent=1) + "\n")
 
 
 if __name__ == "__main__":
