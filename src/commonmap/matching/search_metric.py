@@ -33,6 +33,7 @@ def search_metric(
     min_overlap: float,
     mirrored: bool = False,
     n_peaks: int = 16,
+    arrays: str = "numpy",
     workers: int = 2,
     budget: float = 4e7,
     progress: Progress = no_progress,
@@ -77,6 +78,7 @@ def search_metric(
         floor=floor,
         height_range=(0.0, float(max(height.max(), t_height.max(), floor))),
         min_cells=max(4, int(min_overlap * n_known)),
+        xp=arrays,
         workers=1,
     )
     one = partial(

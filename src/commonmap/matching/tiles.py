@@ -352,7 +352,7 @@ def _on_cluster(address: str, tasks: Iterator[Task]) -> Iterator[Float64s]:
         first = [
             client.submit(search_tile, task, pure=False) for task in islice(tasks, 2 * n_threads)
         ]
-        waiting = distributed.as_completed(first)
+        waiting = distributed.as_completed(first, loop=client.loop)
         for done in waiting:
             peaks = done.result()
             for task in islice(tasks, 1):
