@@ -55,6 +55,10 @@ ConfigFile = Annotated[
     Path | None,
     typer.Option("--config", help="Configuration, .json or .toml; options win over it."),
 ]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(metavar="tcp://HOST:PORT", help="Search on the workers of a Dask scheduler."),
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
 
 
@@ -103,10 +107,11 @@ def run_command(
     level: Level = None,
     seed: Seed = None,
     config: ConfigFile = None,
+    scheduler: Scheduler = None,
     quiet: Quiet = False,
 ) -> int:
     """Match two maps and, where the match is accepted, merge them: all results in one folder."""
-    settings = _settings(config, metric, max_height, resolution, level, seed)
+    settings = _settings(config, metric, max_height, resolution, level, seed, scheduler)
     from commonmap import cli_results, pipeline
     from commonmap.cli_progress import telling
 
@@ -139,10 +144,11 @@ def match_command(
     level: Level = None,
     seed: Seed = None,
     config: ConfigFile = None,
+    scheduler: Scheduler = None,
     quiet: Quiet = False,
 ) -> int:
     """Find the pose of DRAFT in BASE's frame, with an honest yes or no."""
-    settings = _settings(config, metric, max_height, resolution, level, seed)
+    settings = _settings(config, metric, max_height, resolution, level, seed, scheduler)
     from commonmap import cli_results, pipeline
     from commonmap.cli_progress import telling
     from commonmap.report.pose import to_json
@@ -322,7 +328,7 @@ def metrics_command() -> int:
 
 def _settings(
     file: Path | None, metric: str | None, max_height: float | None, resolution: float | None,
-    level: str | None, seed: int | None,
+    level: str | None, seed: int | None, scheduler: str | None = None,
 ) -> Config:  # fmt: skip
     """Return the configuration of a file with the options of the command line on top."""
     from dataclasses import replace
@@ -333,6 +339,7 @@ def _settings(
         grid={"resolution": resolution, "max_height": max_height},
         level={"mode": level},
         search={"metric": metric},
+        compute={"scheduler": scheduler},
     )
     if metric is not None:
         from commonmap.metrics.table import find_metric

@@ -189,12 +189,12 @@ def _search(
     if METRICS[config.search.metric].layers == "slabs":
         return search(
             base.slabs, draft.slabs, min_overlap=least_overlap(config), mirrored=mirrored,
-            workers=WORKERS, progress=tell,
+            workers=WORKERS, compute=config.compute, progress=tell,
         )  # fmt: skip
     return search_metric(
         base.grid, draft.grid, metric=config.search.metric, normalise=config.search.normalise,
         floor=config.search.floor, min_overlap=least_overlap(config), mirrored=mirrored,
-        workers=WORKERS, progress=tell,
+        arrays=config.compute.arrays, workers=WORKERS, progress=tell,
     )  # fmt: skip
 
 
