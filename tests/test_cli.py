@@ -130,7 +130,8 @@ def test_run_finds_the_pose_and_leaves_every_product(
     assert done.code == 0, done.err
     assert "accepted" in done.out
     assert {path.name for path in out.iterdir()} == set(cli_results.ENTRIES) - {
-        "base.laz", "draft.laz", "truth.json",
+        "base.laz", "draft.laz", "truth.json", "odometry.json",
+        "base_trajectory.tum", "draft_trajectory.tum",
     }  # fmt: skip
     values = json.loads((out / "match.json").read_text(), parse_constant=pytest.fail)
     assert set(values) >= KEYS
@@ -478,7 +479,7 @@ def test_version_and_help(run: Run) -> None:
     from commonmap.version import __version__
 
     assert run("--version") == (0, f"commonmap {__version__}\n", "")
-    for command in ("run", "match", "merge", "demo", "simulate", "info", "metrics"):
+    for command in ("run", "match", "merge", "odometry", "demo", "simulate", "info", "metrics"):
         assert command in run("--help").out
         assert run(command, "--help").code == 0
 

@@ -18,8 +18,8 @@ LAYERS = (
     ("matching",),
     ("merging",),
     ("sim",),
-    ("pipeline", "pipeline_logs"),
-    ("study", "report", "cli", "cli_progress", "cli_results", "__init__"),
+    ("pipeline", "pipeline_logs", "demo"),
+    ("study", "report", "cli", "cli_logs", "cli_progress", "cli_results", "__init__"),
 )
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 MODULES = sorted(ROOT.rglob("*.py"))

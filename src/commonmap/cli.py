@@ -22,7 +22,9 @@ from commonmap.errors import CommonmapError, InputError
 from commonmap.version import __version__
 
 if TYPE_CHECKING:
+    from commonmap.cli_logs import Input
     from commonmap.config import Config
+    from commonmap.odometry import TrajectoryErrors
     from commonmap.types import Cloud, Leaves, Match
 
 USAGE_ERROR: Any = typer.BadParameter.__mro__[2]
@@ -54,6 +56,20 @@ Seed = Annotated[int | None, typer.Option(help="Seed where chance enters.")]
 ConfigFile = Annotated[
     Path | None,
     typer.Option("--config", help="Configuration, .json or .toml; options win over it."),
+]
+OdometryMethod = Annotated[
+    str | None,
+    typer.Option("--odometry", metavar="loam|poses|kiss-icp", help="Raw logs: how to find poses."),
+]
+Poses = Annotated[
+    list[Path] | None,
+    typer.Option("--poses", help="Raw logs: known poses (TUM, KITTI, bag), one a log, in order."),
+]
+Topic = Annotated[
+    list[str] | None, typer.Option("--topic", help="Raw logs: topic of the scans, one a log.")
+]
+KeepPartial = Annotated[
+    bool, typer.Option("--keep-partial", help="Raw logs: keep what can be read of a damaged one.")
 ]
 Scheduler = Annotated[
     str | None,
@@ -108,22 +124,30 @@ def run_command(
     seed: Seed = None,
     config: ConfigFile = None,
     scheduler: Scheduler = None,
+    odometry: OdometryMethod = None,
+    poses: Poses = None,
+    topic: Topic = None,
+    keep_partial: KeepPartial = False,
     quiet: Quiet = False,
 ) -> int:
-    """Match two maps and, where the match is accepted, merge them: all results in one folder."""
+    """Match two maps and, where the match is accepted, merge them: all results in one folder.
+
+    BASE and DRAFT are maps (clouds, octrees) or raw logs of a lidar (pcap, bag, mcap, folder).
+    """
     settings = _settings(config, metric, max_height, resolution, level, seed, scheduler)
     from commonmap import cli_results, pipeline
     from commonmap.cli_progress import telling
 
     cli_results.check_folder(out)
     with _notes(quiet), telling(quiet=quiet) as progress:
-        target, source = _read_both(base, draft, progress)
-        result = pipeline.run(target, source, config=settings, progress=progress)
+        target, source = _take_both(base, draft, odometry, poses, topic, keep_partial, progress)
+        result = pipeline.run(target.map, source.map, config=settings, progress=progress)
         progress("write the results")
         with cli_results.results_folder(out) as part:
             names = cli_results.write_run(
-                part, target=target, source=source, match=result.match, common=result.common,
-                config=settings, names=(base.name, draft.name),
+                part, target=target.map, source=source.map, match=result.match,
+                common=result.common, config=settings, names=(base.name, draft.name),
+                robots=(target.robot, source.robot),
             )  # fmt: skip
     if not quiet:
         _say_match(result.match)
@@ -145,9 +169,16 @@ def match_command(
     seed: Seed = None,
     config: ConfigFile = None,
     scheduler: Scheduler = None,
+    odometry: OdometryMethod = None,
+    poses: Poses = None,
+    topic: Topic = None,
+    keep_partial: KeepPartial = False,
     quiet: Quiet = False,
 ) -> int:
-    """Find the pose of DRAFT in BASE's frame, with an honest yes or no."""
+    """Find the pose of DRAFT in BASE's frame, with an honest yes or no.
+
+    BASE and DRAFT are maps (clouds, octrees) or raw logs of a lidar (pcap, bag, mcap, folder).
+    """
     settings = _settings(config, metric, max_height, resolution, level, seed, scheduler)
     from commonmap import cli_results, pipeline
     from commonmap.cli_progress import telling
@@ -156,11 +187,11 @@ def match_command(
     if out is not None:
         cli_results.check_file(out)
     with _notes(quiet), telling(quiet=quiet) as progress:
-        target, source = _read_both(base, draft, progress)
-        found = pipeline.match_maps(target, source, config=settings, progress=progress)
+        target, source = _take_both(base, draft, odometry, poses, topic, keep_partial, progress)
+        found = pipeline.match_maps(target.map, source.map, config=settings, progress=progress)
     values = cli_results.match_to_dict(
         found, config=settings, names=(base.name, draft.name),
-        n_points=(_size(target), _size(source)),
+        n_points=(_size(target.map), _size(source.map)),
     )  # fmt: skip
     if out is None:
         print(to_json(values), end="")
@@ -210,13 +241,67 @@ def merge_command(
     return 0
 
 
+@app.command("odometry")
+def odometry_command(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="Raw log: pcap, bag, mcap, folder.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Trajectory of the lidar (TUM).")],
+    cloud: Annotated[
+        Path | None, typer.Option("--cloud", help="Map of the log: .laz .las .ply .pcd ...")
+    ] = None,
+    truth: Annotated[
+        Path | None, typer.Option("--truth", help="True poses (TUM, KITTI): print the errors.")
+    ] = None,
+    odometry: OdometryMethod = None,
+    poses: Annotated[
+        Path | None, typer.Option("--poses", help="Known poses (TUM, KITTI, bag).")
+    ] = None,
+    topic: Annotated[str | None, typer.Option(help="Topic of the scans.")] = None,
+    keep_partial: KeepPartial = False,
+    quiet: Quiet = False,
+) -> int:
+    """Find the way of the lidar of a raw log, and its level, deskewed map."""
+    from commonmap import cli_logs, cli_results
+    from commonmap.cli_progress import telling
+    from commonmap.io.formats import find_writer, write_map
+    from commonmap.io.logs import read_poses
+    from commonmap.io.trajectory import write_trajectory
+    from commonmap.odometry import compare
+
+    if not log.exists():
+        raise InputError(f"there is no file or folder {log}")
+    for path in (out, cloud):
+        if path is not None:
+            cli_results.check_file(path)
+    if cloud is not None and find_writer(cloud).holds != "cloud":
+        raise InputError(f"--cloud is a file of points; {cloud} came")
+    options = cli_logs.LogOptions(odometry, poses, topic, keep_partial)
+    options.chosen()
+    with _notes(quiet), telling(quiet=quiet) as progress:
+        known = None if truth is None else read_poses(truth)
+        robot = cli_logs.take_log(log, options, progress)
+        errors = None if known is None else compare(robot.trajectory, known)
+        progress("write the results")
+        write_trajectory(out, robot.trajectory)
+        if cloud is not None:
+            write_map(cloud, robot.cloud)
+    if not quiet:
+        print(
+            f"{robot.n_turns} turns, {robot.way:.1f} m; lost in {robot.odometry.n_lost}, "
+            f"degenerate in {robot.odometry.n_degenerate}"
+        )
+        if errors is not None:
+            _say_errors("trajectory", errors)
+        print("written: " + ", ".join(str(path) for path in (out, cloud) if path is not None))
+    return 0
+
+
 @app.command("demo")
 def demo_command(
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the results.")] = Path(
         "demo-out"
     ),
     scene: Annotated[str, typer.Option(help="Kind of place to simulate.")] = "paper",
-    drift: Annotated[float, typer.Option(help="Error of the poses, share of the way.")] = 0.003,
+    seconds: Annotated[float, typer.Option(help="Length of the logs, at most.")] = 60.0,
     metric: Metric = None,
     max_height: MaxHeight = None,
     resolution: Resolution = None,
@@ -224,38 +309,47 @@ def demo_command(
     config: ConfigFile = None,
     quiet: Quiet = False,
 ) -> int:
-    """Simulate two robots in one place, run the job on their maps, say how far from the truth."""
+    """Simulate the raw logs of two robots, make their common map, say how far from the truth."""
     settings = _settings(config, metric, max_height, resolution, None, seed)
+    import shutil
+
     import numpy as np
 
-    from commonmap import cli_results, pipeline
+    from commonmap import cli_results
     from commonmap.cli_progress import telling
-    from commonmap.io.formats import write_map
+    from commonmap.demo import BASE_LOG, DRAFT_LOG, run_demo
 
     cli_results.check_folder(out)
-    note = (
-        "Simulated: the maps are made with the robots' true poses and a drift of "
-        f"{100 * drift:g} % of the way, not yet with lidar odometry."
-    )
-    with _notes(quiet), telling(quiet=quiet) as progress:
-        shown = pipeline.demo(
-            rng=np.random.default_rng(settings.seed), scene=scene, drift=drift, config=settings,
-            progress=progress,
+    names = (f"drone ({BASE_LOG})", f"ground robot ({DRAFT_LOG})")
+    note = "Simulated raw logs; the maps were made of them by LOAM, which was not told the truth."
+    with (
+        _notes(quiet),
+        telling(quiet=quiet) as progress,
+        cli_results.results_folder(out) as part,
+    ):
+        logs = part / "logs"
+        logs.mkdir()
+        shown = run_demo(
+            logs, rng=np.random.default_rng(settings.seed), scene=scene, seconds=seconds,
+            config=settings, progress=progress,
         )  # fmt: skip
+        shutil.rmtree(logs)
         error = None if shown.metres is None else (shown.metres, shown.radians or 0.0)
         progress("write the results")
-        with cli_results.results_folder(out) as part:
-            write_map(part / "base.laz", shown.target)
-            write_map(part / "draft.laz", shown.source)
-            truth = {"T_target_source": shown.T_target_source, "seed": settings.seed}
-            cli_results.write_json(part / "truth.json", {**truth, "scene": scene, "drift": drift})
-            cli_results.write_run(
-                part, target=shown.target, source=shown.source, match=shown.result.match,
-                common=shown.result.common, config=settings,
-                names=("base.laz (drone)", "draft.laz (ground robot)"), notes=[note], error=error,
-            )  # fmt: skip
+        truth = {
+            "T_target_source": shown.T_target_source, "seed": settings.seed, "scene": scene,
+            "seconds": seconds, "map_errors": shown.map_errors,
+        }  # fmt: skip
+        cli_results.write_json(part / "truth.json", truth)
+        cli_results.write_run(
+            part, target=shown.base.cloud, source=shown.draft.cloud, match=shown.result.match,
+            common=shown.result.common, config=settings, names=names, notes=[note], error=error,
+            robots=(shown.base, shown.draft), errors=shown.errors,
+        )  # fmt: skip
     if not quiet:
         print(note)
+        for name, errors in zip(names, shown.errors, strict=True):
+            _say_errors(name, errors)
         _say_match(shown.result.match)
         if error is not None:
             print(f"from the truth: {error[0]:.3f} m, {math.degrees(error[1]):.3f} degrees")
@@ -267,6 +361,12 @@ def demo_command(
 def simulate_command(
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for logs, poses and truth.")],
     scene: Annotated[str, typer.Option(help="Kind of place to simulate.")] = "paper",
+    logs: Annotated[
+        str, typer.Option(help="Raw logs to write: pcap, mcap, kitti, joined by commas, or none.")
+    ] = "pcap,mcap,kitti",
+    seconds: Annotated[
+        float | None, typer.Option(help="Length of the raw logs, at most; else the whole way.")
+    ] = None,
     overlap: Annotated[float, typer.Option(help="Share of the draft that the base covers.")] = 1.0,
     drift: Annotated[float, typer.Option(help="Error of the poses, share of the way.")] = 0.003,
     tilt_deg: Annotated[float, typer.Option(help="Tilt of the draft's frame, degrees.")] = 0.0,
@@ -274,7 +374,10 @@ def simulate_command(
     seed: Seed = None,
     quiet: Quiet = False,
 ) -> int:
-    """Simulate a drone and a ground robot in one place and write what they recorded."""
+    """Simulate a drone and a ground robot in one place and write what they recorded.
+
+    Each robot's folder holds its raw logs, its map with drifting poses, and its true poses.
+    """
     settings = _settings(None, None, None, None, None, seed)
     import numpy as np
 
@@ -284,7 +387,8 @@ def simulate_command(
     with _notes(quiet), telling(quiet=quiet) as progress:
         pair = write_simulation(
             out, scene, np.random.default_rng(settings.seed), overlap=overlap, drift=drift,
-            tilt=math.radians(tilt_deg), change=change, progress=progress,
+            tilt=math.radians(tilt_deg), change=change, scans_every=0, seconds=seconds,
+            logs=[] if logs == "none" else logs.split(","), progress=progress,
         )  # fmt: skip
     if not quiet:
         print(f"overlap: {100 * pair.overlap:.0f} % of the draft")
@@ -358,6 +462,34 @@ def _read_both(base: Path, draft: Path, progress: Any) -> tuple[Cloud | Leaves, 
     target = read_map(base)
     progress(f"read {draft.name}")
     return target, read_map(draft)
+
+
+def _take_both(
+    base: Path, draft: Path, method: str | None, poses: list[Path] | None,
+    topics: list[str] | None, keep_partial: bool, progress: Any,
+) -> tuple[Input, Input]:  # fmt: skip
+    """Return both inputs as maps; raw logs go through odometry first."""
+    from commonmap import cli_logs
+
+    for path in (base, draft):
+        if not path.exists():
+            raise InputError(f"there is no file {path}")
+    options = cli_logs.options_of_both(
+        [base, draft], method=method, poses=poses or [], topics=topics or [],
+        keep_partial=keep_partial,
+    )  # fmt: skip
+    for one in options:
+        one.chosen()
+    first = cli_logs.take(base, options[0], progress)
+    return first, cli_logs.take(draft, options[1], progress)
+
+
+def _say_errors(name: str, errors: TrajectoryErrors) -> None:
+    print(
+        f"{name}: {errors.way:.0f} m, absolute error {errors.ape:.3f} m (most "
+        f"{errors.ape_max:.3f}), relative {100 * errors.relative:.2f} % and "
+        f"{math.degrees(errors.turn):.4f} deg/m over {errors.stretch:.0f} m"
+    )
 
 
 def _say_match(match: Match) -> None:

@@ -21,7 +21,11 @@ from commonmap.io.atomic import writing, writing_folder
 from commonmap.io.formats import write_map
 from commonmap.io.nav2 import write_nav2_map
 from commonmap.io.raster import write_geotiff
+from commonmap.io.trajectory import write_trajectory
 from commonmap.merging.products import CommonMap, Map
+from commonmap.odometry import TrajectoryErrors
+from commonmap.pipeline_logs import RobotMap, describe_robot, move_trajectory
+from commonmap.report.odometry import Way, odometry_section
 from commonmap.report.page import write_report
 from commonmap.report.pose import static_transform_command, to_json
 from commonmap.types import Cloud, Float64s, Match
@@ -32,6 +36,7 @@ COVARIANCE_ORDER = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")
 ENTRIES = (
     "match.json", "config.json", "report.html", "common.ot", "common.laz", "height_map.tif",
     "map.pgm", "map.yaml", "transform.txt", "base.laz", "draft.laz", "truth.json",
+    "odometry.json", "base_trajectory.tum", "draft_trajectory.tum",
 )  # fmt: skip
 """Every name a run or a demo may leave in its folder, and so may replace there."""
 
@@ -113,8 +118,14 @@ def write_run(
     folder: Path, *, target: Map, source: Map, match: Match, common: CommonMap | None,
     config: Config, names: tuple[str, str], notes: Sequence[str] = (),
     error: tuple[float, float] | None = None,
+    robots: tuple[RobotMap | None, RobotMap | None] = (None, None),
+    errors: tuple[TrajectoryErrors | None, TrajectoryErrors | None] = (None, None),
 ) -> list[str]:  # fmt: skip
-    """Write all results of a run into a folder and return their names; see `ENTRIES`."""
+    """Write all results of a run into a folder and return their names; see `ENTRIES`.
+
+    robots: what became of the raw logs, where inputs were some. errors: of their trajectories, and
+    error: (metres, radians) of the answer, where the truth is known.
+    """
     sizes = (_size(target), _size(source))
     values = match_to_dict(match, config=config, names=names, n_points=sizes)
     write_json(folder / "match.json", values)
@@ -139,11 +150,53 @@ def write_run(
         written += [
             "common.ot", "common.laz", "height_map.tif", "map.pgm", "map.yaml", "transform.txt",
         ]  # fmt: skip
+    ways = _ways(match, names, robots, errors)
+    written += _write_robots(folder, ways)
     write_report(
         folder / "report.html", target=target, source=source, match=match, config=config,
-        common=common, names=names, notes=notes, error=error,
+        common=common, names=names, notes=notes, error=error, sections=[odometry_section(ways)],
     )  # fmt: skip
     return [*written, "report.html"]
+
+
+def _ways(
+    match: Match, names: tuple[str, str], robots: tuple[RobotMap | None, RobotMap | None],
+    errors: tuple[TrajectoryErrors | None, TrajectoryErrors | None],
+) -> list[Way]:  # fmt: skip
+    """Return the robots that handed in logs, their ways in the base's frame where it is known."""
+    T = {"base": np.eye(4), "draft": match.T_target_source}
+    ways = []
+    for part, name, robot, error in zip(("base", "draft"), names, robots, errors, strict=True):
+        if robot is not None:
+            T_base_map = T[part]
+            moved = None if T_base_map is None else move_trajectory(T_base_map, robot.trajectory)
+            ways.append(Way(name, part, robot, moved, error))
+    return ways
+
+
+def _write_robots(folder: Path, ways: Sequence[Way]) -> list[str]:
+    """Write map, way and health of the robots that handed in logs; return the names of the files.
+
+    The maps are in the robots' own frames; so is the way of a draft that was refused.
+    """
+    written = []
+    told: dict[str, Any] = {}
+    for way in ways:
+        write_map(folder / f"{way.part}.laz", way.robot.cloud)
+        trajectory = way.trajectory or way.robot.trajectory
+        write_trajectory(folder / f"{way.part}_trajectory.tum", trajectory)
+        frame = "the draft's own map" if way.trajectory is None else "base"
+        told[way.part] = {
+            "name": way.name,
+            "trajectory_frame": frame,
+            "directions_frame": f"the {way.part}'s own map",
+            **describe_robot(way.robot, way.errors),
+        }
+        written += [f"{way.part}.laz", f"{way.part}_trajectory.tum"]
+    if told:
+        write_json(folder / "odometry.json", told)
+        written.append("odometry.json")
+    return written
 
 
 def transform_text(

@@ -1,4 +1,4 @@
-"""Each job as one page, read from top to bottom: match, merge, run, demo.
+"""Each job as one page, read from top to bottom: match, merge, run.
 
 No file is opened here: maps come in, answers go out.
 """
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from commonmap.config import Config
 from commonmap.errors import InputError
-from commonmap.frames import apply, check_points, check_T, difference
+from commonmap.frames import apply, check_points, check_T
 from commonmap.mapping.points import points_of
 from commonmap.matching.match import match
 from commonmap.merging.products import (
@@ -28,7 +28,7 @@ from commonmap.merging.products import (
     navigation_map,
 )
 from commonmap.metrics.table import find_metric
-from commonmap.types import Cloud, Float64s, Leaves, Match, Progress, no_progress
+from commonmap.types import Cloud, Leaves, Match, Progress, no_progress
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,22 +37,6 @@ class Result:
 
     match: Match
     common: CommonMap | None
-
-
-@dataclass(frozen=True, eq=False)
-class Demo:
-    """A simulated job and how far its answer is from the truth.
-
-    T_target_source: the truth, (4, 4). metres: distance between answer and truth at the middle of
-    the draft. radians: angle between them. Both None where the match was refused.
-    """
-
-    target: Cloud
-    source: Cloud
-    T_target_source: Float64s
-    result: Result
-    metres: float | None
-    radians: float | None
 
 
 def match_maps(
@@ -138,36 +122,6 @@ def run(
     common = merge_maps(target, source, found.T_target_source, config=config, progress=progress)
     seconds = time.perf_counter() - start
     return Result(replace(found, timings={**found.timings, "merge": seconds}), common)
-
-
-def demo(
-    *,
-    rng: np.random.Generator,
-    scene: str = "paper",
-    drift: float = 0.003,
-    config: Config | None = None,
-    progress: Progress = no_progress,
-) -> Demo:
-    """Return two simulated robots' maps of one place, the job run on them, and its error.
-
-    scene: a name of `commonmap.sim.worlds.WORLDS`. drift: error of the robots' poses as a share of
-    the way they went; the maps are made with the true poses and this drift.
-    """
-    from commonmap.sim.pairs import simulate_pair
-
-    # 1. a drone over the place and a ground robot in it: two clouds, each in its own frame
-    progress("simulate two robots")
-    pair = simulate_pair(scene, rng=rng, drift=drift)
-
-    # 2. the job; it is not told the truth
-    result = run(pair.target, pair.source, config=config, progress=progress)
-
-    # 3. how far from the truth, in the middle of the draft
-    metres = radians = None
-    if result.match.T_target_source is not None:
-        centre = pair.source.xyz.mean(axis=0)
-        metres, radians = difference(result.match.T_target_source, pair.T_target_source, centre)
-    return Demo(pair.target, pair.source, pair.T_target_source, result, metres, radians)
 
 
 def as_map(map_: Map | ArrayLike) -> Map:

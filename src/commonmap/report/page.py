@@ -55,13 +55,15 @@ def write_report(
     names: tuple[str, str] = ("base", "draft"),
     notes: Sequence[str] = (),
     error: tuple[float, float] | None = None,
+    sections: Sequence[str] = (),
 ) -> None:
     """Write the report of a match, and of the common map where there is one, as one HTML file.
 
     names: of the two maps, as the user knows them. notes: sentences shown under the verdict.
-    error: (metres, radians) from the truth, where the truth is known.
+    error: (metres, radians) from the truth, where the truth is known. sections: HTML of further
+        sections, shown after the plans.
     """
-    html = build_page(target, source, match, config, common, names, notes, error)
+    html = build_page(target, source, match, config, common, names, notes, error, sections)
     with writing(path) as part:
         part.write_text(html, encoding="utf-8")
 
@@ -69,6 +71,7 @@ def write_report(
 def build_page(
     target: Map, source: Map, match: Match, config: Config, common: CommonMap | None,
     names: tuple[str, str], notes: Sequence[str], error: tuple[float, float] | None,
+    extra: Sequence[str] = (),
 ) -> str:  # fmt: skip
     """Return the report as the text of an HTML page."""
     T = match.T_target_source
@@ -81,6 +84,7 @@ def build_page(
         _verdict(match, names, notes, error),
         _viewer(base, draft, common, accepted=T is not None),
         _plans(base, draft, common, accepted=T is not None),
+        *extra,
         _search(match, centre),
         _section(
             "Why this verdict", "All figures are of the best pose that the search found.",

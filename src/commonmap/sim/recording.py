@@ -66,9 +66,7 @@ def write_logs(
 
     turns: gives them from the first on, the same at each call. sensor: their true poses.
     """
-    for kind in kinds:
-        if kind not in LOGS:
-            raise InputError(f"a raw log is one of {', '.join(LOGS)}; {kind!r} came")
+    check_kinds(kinds)
     if "kitti" in kinds:
         write_kitti(folder / "kitti", turns())
         turns = _from(folder / "kitti")
@@ -77,6 +75,13 @@ def write_logs(
     if "mcap" in kinds:
         poses = Trajectory(sensor.time[::5], sensor.T_map_sensor[::5])
         write_mcap(folder / "log.mcap", turns(), poses=poses, n_channels=lidar.n_channels)
+
+
+def check_kinds(kinds: Collection[str]) -> None:
+    """Raise where a kind of raw log is not in `LOGS`."""
+    for kind in kinds:
+        if kind not in LOGS:
+            raise InputError(f"a raw log is one of {', '.join(LOGS)}; {kind!r} came")
 
 
 def _from(folder: Path) -> Callable[[], Iterable[Scan]]:

@@ -7,12 +7,14 @@ DIR/uav/, DIR/ugv/            target and source robot, each with
     truth.tum                 true poses of its lidar, frame of the world
     scans/000000.bin          one turn: float32 x, y, z, intensity a return, not deskewed
     scans/000000.npy          the same returns: time (float64, s) and ring (uint16)
+    log.pcap, log.mcap, kitti/  every turn as raw logs, where asked for (`sim.recording`)
 """
 
 from __future__ import annotations
 
 import json
 import os
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,7 @@ from commonmap.io.atomic import writing_folder
 from commonmap.io.las import write_las
 from commonmap.sim.missions import Mission
 from commonmap.sim.pairs import Pair, before_border, simulate_pair
+from commonmap.sim.recording import check_kinds, record, write_logs
 from commonmap.sim.scanning import RayCaster, place_points, scan_world, split_scans, turn_stamps
 from commonmap.sim.vlp16 import LidarModel, find_lidar
 from commonmap.sim.world import World
@@ -53,6 +56,8 @@ def write_simulation(
     relief: float | None = None,
     scans_every: int = 5,
     azimuth_decimation: int = 1,
+    logs: Collection[str] = (),
+    seconds: float | None = None,
     progress: Progress = no_progress,
 ) -> Pair:
     """Simulate two robots in one place and write what they recorded, and the truth; return both.
@@ -62,10 +67,12 @@ def write_simulation(
     scans_every: write every so many turns of the lidar (1 is all of them, 10 a second, which
         odometry needs: some 7 MB/s a robot); 0 writes no scans.
     azimuth_decimation: fire only every so many firing sequences in the scans that are written.
+    logs: raw logs of every turn, names of `recording.LOGS`. seconds: of the logs, at most.
     The others are those of `simulate_pair`.
     """
     if scans_every < 0:
         raise InputError(f"scans_every must be 0 or more; {scans_every} came")
+    check_kinds(logs)
     progress("simulate")
     pair = simulate_pair(
         kind, rng=rng, seed_world=seed_world, overlap=overlap, drift=drift, tilt=tilt,
@@ -84,10 +91,16 @@ def write_simulation(
                 part / robot, cloud, known, mission, world, models[robot], border, rng,
                 scans_every, azimuth_decimation, progress,
             )  # fmt: skip
+            if logs:
+                _record_robot(
+                    part / robot, mission, world, models[robot], border, int(rng.integers(2**31)),
+                    logs, seconds, progress,
+                )  # fmt: skip
         truth = tell_truth(pair, rng) | {
             "lidars": {robot: model.name for robot, model in models.items()},
             "scans_every": scans_every,
             "azimuth_decimation": azimuth_decimation,
+            "logs": list(logs),
         }
         (part / "truth.json").write_text(json.dumps(truth, indent=2) + "\n", encoding="utf-8")
     return pair
@@ -152,6 +165,23 @@ def _write_robot(
             if len(scan.xyz):
                 write_scan(folder / "scans" / f"{number:06d}", scan)
             number += 1
+
+
+def _record_robot(
+    folder: Path, mission: Mission, world: World, lidar: LidarModel, border: Float64s | None,
+    seed: int, logs: Collection[str], seconds: float | None, progress: Progress,
+) -> None:  # fmt: skip
+    """Write what the lidar of a robot records on its way as raw logs."""
+
+    def turns() -> Iterator[Scan]:
+        rng = np.random.default_rng(seed)
+        step = f"record {folder.name}"
+        return record(
+            mission, world, lidar, rng=rng, seconds=seconds, border=border, step=step,
+            progress=progress,
+        )  # fmt: skip
+
+    write_logs(folder, turns, mission.sensor, lidar, logs)
 
 
 def _pick(scan: Scan, kept: np.ndarray[Any, np.dtype[np.bool_]]) -> Scan:
