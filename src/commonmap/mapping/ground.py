@@ -17,11 +17,15 @@ import numpy as np
 from scipy import ndimage
 
 from commonmap.errors import EmptyMapError
-from commonmap.mapping.points import bounds
+from commonmap.mapping.points import bounds, sample
 from commonmap.types import Bools, Float64s
 
 MAX_SLOPE = math.tan(math.radians(38.0))
 """Steepest ground that is believed: 30 degrees, and what roughness adds over one cell."""
+
+
+PLANE_CELLS = 20_000
+"""Cells that the plane under a map is fitted to."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +43,7 @@ class Ground:
 
     def height_at(self, xy: Float64s) -> Float64s:
         """Return the ground's z at (N, 2) positions, bilinear, constant past the outer centres."""
-        position = np.ascontiguousarray(xy, dtype=np.float64)
+        position = np.asarray(xy, dtype=np.float64)
         return np.asarray(_bilinear(self.z, self.origin, self.cell, position))
 
 
@@ -131,17 +135,19 @@ def fill(z: Float64s) -> Float64s:
 def _fit_plane(z: Float64s, known: Bools) -> Float64s:
     """Return the least-squares plane through the known cells, three times reweighted (Cauchy)."""
     i, j = np.nonzero(known)
-    A = np.column_stack([i - i.mean(), j - j.mean(), np.ones(len(i))]).astype(np.float64)
-    b, w = z[known], np.ones(len(i))
+    middle_i, middle_j = i.mean(), j.mean()
+    few = sample(np.column_stack([i - middle_i, j - middle_j, z[known]]), PLANE_CELLS)
+    A, b = np.column_stack([few[:, :2], np.ones(len(few))]), few[:, 2]
+    w = np.ones(len(few))
     x: Float64s = np.zeros(3)
     for _ in range(4):
-        N = (A * w[:, None]).T @ A + 1e-9 * len(i) * np.eye(3)
+        N = (A * w[:, None]).T @ A + 1e-9 * len(few) * np.eye(3)
         x = np.asarray(np.linalg.solve(N, (A * w[:, None]).T @ b), dtype=np.float64)
         residual = b - A @ x
         scale = 1.4826 * float(np.median(np.abs(residual))) + 1e-3
         w = 1.0 / (1.0 + (residual / (2.0 * scale)) ** 2)
     I, J = np.meshgrid(*(np.arange(n, dtype=np.float64) for n in z.shape), indexing="ij")
-    return np.asarray((I - i.mean()) * x[0] + (J - j.mean()) * x[1] + x[2])
+    return np.asarray((I - middle_i) * x[0] + (J - middle_j) * x[1] + x[2])
 
 
 def _halve(a: Float64s) -> Float64s:
@@ -173,12 +179,30 @@ def _lowest(xyz, origin, cell, nx, ny):  # type: ignore[no-untyped-def]
 
 
 def _drop_low_blunders(lowest: Float64s, cell: float) -> Float64s:
-    """Return `lowest` without cells far below the fourth lowest of their 7x7 neighbours."""
-    high = np.where(np.isfinite(lowest), lowest, np.inf)
-    fourth = ndimage.rank_filter(high, rank=4, size=7, mode="constant", cval=np.inf)
+    """Return `lowest` without cells far below all but three of their 7x7 neighbours."""
     reach = 3.0 * math.sqrt(2.0) * cell * MAX_SLOPE + 0.5
-    blunder = np.isfinite(fourth) & (high < fourth - reach)
-    return np.where(blunder, np.nan, lowest)
+    return np.asarray(_without_blunders(lowest, reach))
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _without_blunders(lowest, reach):  # type: ignore[no-untyped-def]
+    nx, ny = lowest.shape
+    kept = lowest.copy()
+    for i in range(nx):
+        for j in range(ny):
+            z = lowest[i, j]
+            if np.isnan(z):
+                continue
+            low, seen = 0, 0  # of the neighbours and the cell itself
+            for a in range(max(i - 3, 0), min(i + 4, nx)):
+                for b in range(max(j - 3, 0), min(j + 4, ny)):
+                    seen += not np.isnan(lowest[a, b])
+                    low += lowest[a, b] <= z + reach
+                if low > 4:
+                    break
+            if low <= 4 and seen > 4:
+                kept[i, j] = np.nan
+    return kept
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]

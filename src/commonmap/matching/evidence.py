@@ -440,6 +440,7 @@ def count_tables(  # type: ignore[no-untyped-def]
     side = 2 * int(np.ceil(np.sqrt(reach) / cell)) + 3
     occupied = np.empty((side, side), np.uint32)
     known = np.empty((side, side), np.uint32)
+    turned = np.empty((xy.shape[0], 2))
     for p in range(poses.shape[0]):
         cosine, sine = np.cos(poses[p, 2]), np.sin(poses[p, 2])
         i0 = int(np.floor((poses[p, 0] - origin[0]) / cell)) - side // 2 - first_i
@@ -447,9 +448,13 @@ def count_tables(  # type: ignore[no-untyped-def]
         occupied[:] = 0
         known[:] = 0
         dx, dy = poses[p, 0] - origin[0], poses[p, 1] - origin[1]
+        if p == 0 or poses[p, 2] != poses[p - 1, 2]:
+            for n in range(xy.shape[0]):
+                turned[n, 0] = cosine * xy[n, 0] - sine * xy[n, 1]
+                turned[n, 1] = sine * xy[n, 0] + cosine * xy[n, 1]
         for n in range(xy.shape[0]):
-            i = int(np.floor((cosine * xy[n, 0] - sine * xy[n, 1] + dx) / cell)) - first_i
-            j = int(np.floor((sine * xy[n, 0] + cosine * xy[n, 1] + dy) / cell)) - first_j
+            i = int(np.floor((turned[n, 0] + dx) / cell)) - first_i
+            j = int(np.floor((turned[n, 1] + dy) / cell)) - first_j
             if 0 <= i < n_x and 0 <= j < n_y:
                 occupied[i - i0, j - j0] |= s_occupied[n]
                 known[i - i0, j - j0] |= s_known[n]

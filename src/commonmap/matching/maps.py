@@ -8,16 +8,17 @@ import numpy as np
 
 from commonmap.config import Config
 from commonmap.errors import EmptyMapError, InputError
-from commonmap.frames import apply, from_rotation
+from commonmap.frames import from_rotation
 from commonmap.mapping.ground import Ground, find_ground
 from commonmap.mapping.height_map import build_height_map, choose_cell, choose_slabs
+from commonmap.mapping.level import MOST_POINTS as LEVEL_POINTS
 from commonmap.mapping.level import Levelling, find_level, no_levelling
-from commonmap.mapping.points import bounds, inside_box, points_of, sample, thin
+from commonmap.mapping.points import bounds, inside_box, move, points_of, sample, thin
 from commonmap.matching.evidence import SlabGrid, pack_slabs
 from commonmap.metrics.table import METRICS
 from commonmap.types import Bools, Cloud, Float64s, GridMap, Leaves
 
-MOST_POINTS = 2_000_000
+MOST_POINTS = 1_000_000
 """Points of a map that the refinement and the verdict look at."""
 
 
@@ -60,12 +61,11 @@ def prepare(item: Cloud | Leaves | Float64s, name: str, config: Config) -> Prepa
     """Return a map with its points level and near the origin, and its ground."""
     xyz = points_of(item, name)
     middle = np.round(np.median(sample(xyz, 100_000), axis=0))
-    local = xyz - middle
-    low, high = bounds(local)
+    low, high = bounds(xyz)
     extent = (high - low)[:2]
-    if len(local) < 100 or float(extent.max()) < 1.0:
+    if len(xyz) < 100 or float(extent.max()) < 1.0:
         raise EmptyMapError(
-            f"the {name} has {len(local)} finite points over {extent[0]:.2g} x "
+            f"the {name} has {len(xyz)} finite points over {extent[0]:.2g} x "
             f"{extent[1]:.2g} m; a map needs at least 100 points over a metre"
         )
     if float(extent.max()) > 100_000:
@@ -77,10 +77,9 @@ def prepare(item: Cloud | Leaves | Float64s, name: str, config: Config) -> Prepa
     elif isinstance(item, Cloud) and item.crs is not None:
         levelling = no_levelling("a map with a coordinate reference system is level")
     else:
-        levelling = find_level(local)
-        if levelling.tilt > 0:
-            local = apply(levelling.T_level_map, local)
+        levelling = find_level(sample(xyz, LEVEL_POINTS) - middle)
     T_prepared_map = levelling.T_level_map @ from_rotation(np.eye(3), -middle)
+    local = move(T_prepared_map, xyz)
     ground = find_ground(local)
     height = local[:, 2] - ground.height_at(local[:, :2])
     return Prepared(local, T_prepared_map, ground, height, levelling)
@@ -120,10 +119,10 @@ def choose_points(
     The voxel is a quarter cell or 0.1 m. around: (K, 3) take only what lies within three cells of
     the plan of these points, metres: a large base is not thinned as a whole.
     """
-    used = np.ones(len(item.xyz), bool) if max_height is None else item.height < max_height
+    xyz = item.xyz if max_height is None else item.xyz[item.height < max_height]
     if around is not None:
         low, high = bounds(around)
-        used &= inside_box(item.xyz, (low - 3.0 * cell)[:2], (high + 3.0 * cell)[:2])
-    xyz = thin(sample(item.xyz[used], MOST_POINTS), min(0.25 * cell, 0.1))
+        xyz = xyz[inside_box(xyz, (low - 3.0 * cell)[:2], (high + 3.0 * cell)[:2])]
+    xyz = thin(sample(xyz, MOST_POINTS), min(0.25 * cell, 0.1))
     height = xyz[:, 2] - item.ground.height_at(xyz[:, :2])
     return Points(xyz, height, height > edges[0])

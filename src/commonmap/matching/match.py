@@ -14,6 +14,7 @@ import numpy as np
 from commonmap.config import Config
 from commonmap.errors import EmptyMapError, InputError
 from commonmap.frames import apply, invert
+from commonmap.mapping.points import move
 from commonmap.matching.decide import Figures, Verdict, decide
 from commonmap.matching.evidence import (
     SlabGrid,
@@ -145,7 +146,7 @@ def _refine(
 ) -> tuple[Refined, float]:  # fmt: skip
     """Return the best pose refined, and the share of inliers there."""
     T = lift(found.T_target_source(), base.ground, draft.ground)
-    there = choose_points(base, cell, edges, max_height, around=apply(T, points.xyz))
+    there = choose_points(base, cell, edges, max_height, around=move(T, points.xyz))
     refined = refine(there.xyz, points.xyz, T, cell=max(cell, found.cell))
     return refined, measure_inliers(there, points, refined.T_target_source, cell)
 
@@ -159,7 +160,7 @@ def _chance(
         return 0.0
     mirrored = mirror(points, decoy)
     T = lift_mirrored(decoy.T_target_source(), base, mirrored)
-    there = choose_points(base, cell, edges, max_height, around=apply(T, mirrored.xyz))
+    there = choose_points(base, cell, edges, max_height, around=move(T, mirrored.xyz))
     refined = refine(
         there.xyz, mirrored.xyz, T, cell=max(cell, decoy.cell), n_most=8_000, settle=False
     )

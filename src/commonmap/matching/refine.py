@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from commonmap.frames import apply, from_rotation
 from commonmap.mapping.ground import Ground
-from commonmap.mapping.points import bounds, inside_box, thin
+from commonmap.mapping.points import bounds, inside_box, move, thin
 from commonmap.types import Float64s
 
 AREAS = 4
@@ -86,7 +86,7 @@ def refine(
     *,
     cell: float,
     threads: int = 1,
-    n_most: int = 40_000,
+    n_most: int = 20_000,
     settle: bool = True,
 ) -> Refined:
     """Return the pose refined on the points, starting from within about one `cell` of the truth.
@@ -96,7 +96,7 @@ def refine(
     points. threads: with more than one the last bits differ from run to run (sums in any order).
     """
     start = np.asarray(T_target_source, dtype=np.float64)
-    moved_source = apply(start, source_xyz)
+    moved_source = move(start, source_xyz)
     low, high = bounds(moved_source)
     low, high = low - 2.0 * cell, high + 2.0 * cell
     inside = inside_box(target_xyz, low, high)
@@ -193,7 +193,7 @@ def _solve_point_to_plane(
     T = T.copy()
     H, scale = np.eye(6), float("inf")
     for _ in range(8):
-        moved = apply(T, source)
+        moved = move(T, source)
         distance, index = tree.query(moved, distance_upper_bound=reach, workers=1)
         hit = np.isfinite(distance)
         if np.count_nonzero(hit) < 20:

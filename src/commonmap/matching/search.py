@@ -290,9 +290,9 @@ def _climb(  # type: ignore[no-untyped-def]
         best, pairs = -np.inf, 0.0
         for _ in range(MOST_STEPS):
             n_trials = 0
-            for a in range(at[0] - 1, at[0] + 2):
-                for b in range(at[1] - 1, at[1] + 2):
-                    for c in range(at[2] - 1, at[2] + 2):
+            for c in range(at[2] - 1, at[2] + 2):
+                for a in range(at[0] - 1, at[0] + 2):
+                    for b in range(at[1] - 1, at[1] + 2):
                         if seen[a, b, c]:
                             continue
                         seen[a, b, c] = True
