@@ -25,6 +25,7 @@ import hashlib
 import json
 import os
 import platform
+import signal
 import subprocess
 import sys
 import tempfile
@@ -155,7 +156,10 @@ class Peer:
 
 
 def run_child(which: str, resolution: float, n: int, budget: float) -> None:
-    """Insert up to n scans into one tree and print the raw figures as JSON."""
+    """Insert up to n scans into one tree and print the raw figures as JSON.
+
+    An interrupt (SIGINT) ends it early, with what was done.
+    """
     work = list(scans(n))
     kind = np.float64 if which == "peer" else np.float32
     tree = Peer(resolution) if which == "peer" else Ours(resolution, int(which))
@@ -165,13 +169,15 @@ def run_child(which: str, resolution: float, n: int, budget: float) -> None:
     before = _peak_mb()
     cpu: list[float] = []
     wall: list[float] = []
+    stop: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, frame: stop.append(number))
     for origin, points in work:
         origin, points = origin.astype(kind), points.astype(kind)
         start, cpu_start = time.perf_counter(), time.thread_time()
         tree.insert(origin, points)
         cpu.append(time.thread_time() - cpu_start)
         wall.append(time.perf_counter() - start)
-        if sum(cpu) > budget:
+        if stop or sum(cpu) > budget:
             break
     peak = _peak_mb() - before
     with tempfile.TemporaryDirectory() as folder:
@@ -334,21 +340,8 @@ def main() -> None:
         which, resolution, n, budget = args.child
         run_child(which, float(resolution), int(n), float(budget))
         return
-    rows = []
+    rows: list[dict[str, Any]] = []
     bandwidth = copy_bandwidth()
-    if args.stream:
-        print("world | turns | points | odometry ms | mapping ms | both, 99 % | share of a core")
-        for world in args.worlds:
-            rows.append(map_stream(world, args.stream_seconds, 0.2))
-            say_stream(rows[-1])
-    else:
-        print(
-            "voxel m | scans | peer ms | ours ms | ratio | two threads: wall, CPU | identical"
-            " | Msteps/s (of bandwidth) | peak MB: peer, ours on one, on two"
-        )
-        for resolution in args.resolution:
-            rows.append(compare(resolution, args.scans, args.peer_seconds, bandwidth))
-            say(rows[-1])
     record = {
         "machine": platform.processor() or platform.machine(),
         "python": platform.python_version(),
@@ -360,8 +353,21 @@ def main() -> None:
         "rows": rows,
     }
     path = args.record or RECORDS / ("octree_stream.json" if args.stream else "octree.json")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(record, indent=1) + "\n")
+    if args.stream:
+        print("world | turns | points | odometry ms | mapping ms | both, 99 % | share of a core")
+        for world in args.worlds:
+            rows.append(map_stream(world, args.stream_seconds, 0.2))
+            say_stream(rows[-1])
+            path.write_text(json.dumps(record, indent=1) + "\n")
+    else:
+        print(
+            "voxel m | scans | peer ms | ours ms | ratio | two threads: wall, CPU | identical"
+            " | Msteps/s (of bandwidth) | peak MB: peer, ours on one, on two"
+        )
+        for resolution in args.resolution:
+            rows.append(compare(resolution, args.scans, args.peer_seconds, bandwidth))
+            say(rows[-1])
+            path.write_text(json.dumps(record, indent=1) + "\n")
 
 
 if __name__ == "__main__":

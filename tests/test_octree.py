@@ -418,6 +418,30 @@ def test_log_odds_of_zero_are_occupied_for_pyoctomap(tmp_path: Path) -> None:
     assert (tmp_path / "ours.bt").read_bytes() == (tmp_path / "peer.bt").read_bytes()
 
 
+@needs_pyoctomap
+@pytest.mark.parametrize("discretize", [False, True])
+def test_leaves_not_pruned_are_those_of_octomaps_lazy_mode(
+    tmp_path: Path, discretize: bool
+) -> None:
+    import pyoctomap
+
+    rng = np.random.default_rng(6)
+    tree, peer = Octree(0.2), pyoctomap.OcTree(0.2)
+    for k in range(3):
+        origin = np.array([0.5 * k, -0.3 * k, 1.5], np.float32)
+        points = room_scan(origin.astype(float), rng)
+        tree.insert(origin, points, max_range=20.0, discretize=discretize)
+        peer.insertPointCloud(points.astype(float), origin.astype(float), 20.0, True, discretize)
+    peer.updateInnerOccupancy()
+    peer.write(str(tmp_path / "peer.ot"))
+    write_octree(tmp_path / "ours.ot", tree.leaves(pruned=False))
+    assert (tmp_path / "ours.ot").read_bytes() == (tmp_path / "peer.ot").read_bytes()
+    assert tree.count_nodes(pruned=False) > tree.count_nodes()
+    peer.writeBinary(str(tmp_path / "peer.bt"))  # prunes
+    write_octree(tmp_path / "ours.bt", tree.leaves())
+    assert (tmp_path / "ours.bt").read_bytes() == (tmp_path / "peer.bt").read_bytes()
+
+
 def test_the_bits_of_a_scan_take_little_memory() -> None:
     rng = np.random.default_rng(9)
     tree = Octree(0.4)
