@@ -52,6 +52,10 @@ MaxHeight = Annotated[
 ]
 Resolution = Annotated[float | None, typer.Option(help="Cell and voxel size, metres.")]
 Level = Annotated[str | None, typer.Option(metavar="auto|off", help="Level maps without gravity.")]
+Area = Annotated[
+    float | None,
+    typer.Option(metavar="METRES", help="Match each area of the draft by itself; find its drift."),
+]
 Seed = Annotated[int | None, typer.Option(help="Seed where chance enters.")]
 ConfigFile = Annotated[
     Path | None,
@@ -121,6 +125,7 @@ def run_command(
     max_height: MaxHeight = None,
     resolution: Resolution = None,
     level: Level = None,
+    area: Area = None,
     seed: Seed = None,
     config: ConfigFile = None,
     scheduler: Scheduler = None,
@@ -134,7 +139,7 @@ def run_command(
 
     BASE and DRAFT are maps (clouds, octrees) or raw logs of a lidar (pcap, bag, mcap, folder).
     """
-    settings = _settings(config, metric, max_height, resolution, level, seed, scheduler)
+    settings = _settings(config, metric, max_height, resolution, level, seed, scheduler, area)
     from commonmap import cli_results, pipeline
     from commonmap.cli_progress import telling
 
@@ -166,6 +171,7 @@ def match_command(
     max_height: MaxHeight = None,
     resolution: Resolution = None,
     level: Level = None,
+    area: Area = None,
     seed: Seed = None,
     config: ConfigFile = None,
     scheduler: Scheduler = None,
@@ -179,7 +185,7 @@ def match_command(
 
     BASE and DRAFT are maps (clouds, octrees) or raw logs of a lidar (pcap, bag, mcap, folder).
     """
-    settings = _settings(config, metric, max_height, resolution, level, seed, scheduler)
+    settings = _settings(config, metric, max_height, resolution, level, seed, scheduler, area)
     from commonmap import cli_results, pipeline
     from commonmap.cli_progress import telling
     from commonmap.report.pose import to_json
@@ -226,6 +232,7 @@ def merge_command(
     T_target_source = cli_results.read_pose(match)
     with _notes(quiet), telling(quiet=quiet) as progress:
         target, source = _read_both(base, draft, progress)
+        source = pipeline.correct(source, cli_results.read_drift(match))
         common = pipeline.merge_maps(
             target, source, T_target_source, config=settings, progress=progress
         )
@@ -433,6 +440,7 @@ def metrics_command() -> int:
 def _settings(
     file: Path | None, metric: str | None, max_height: float | None, resolution: float | None,
     level: str | None, seed: int | None, scheduler: str | None = None,
+    area: float | None = None,
 ) -> Config:  # fmt: skip
     """Return the configuration of a file with the options of the command line on top."""
     from dataclasses import replace
@@ -443,6 +451,7 @@ def _settings(
         grid={"resolution": resolution, "max_height": max_height},
         level={"mode": level},
         search={"metric": metric},
+        areas={"size": area},
         compute={"scheduler": scheduler},
     )
     if metric is not None:
@@ -497,6 +506,10 @@ def _say_match(match: Match) -> None:
     from commonmap.report.pose import pose_figures, sigma_figures
 
     print(match.reason)
+    if match.areas is not None:
+        n_areas = sum(area.T_target_source is not None for area in match.areas.items)
+        print(f"{n_areas} areas by themselves: {100 * match.areas.agreeing:.0f} % find that pose")
+        print(f"drift: {match.areas.reason}")
     if match.T_target_source is None:
         return
     pose = pose_figures(match.T_target_source)

@@ -28,7 +28,7 @@ from commonmap.pipeline_logs import RobotMap, describe_robot, move_trajectory
 from commonmap.report.odometry import Way, odometry_section
 from commonmap.report.page import write_report
 from commonmap.report.pose import static_transform_command, to_json
-from commonmap.types import Cloud, Float64s, Match
+from commonmap.types import Areas, Cloud, DriftField, Float64s, Match
 from commonmap.version import __version__
 
 COVARIANCE_ORDER = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")
@@ -79,12 +79,90 @@ def match_to_dict(
         "T_level_target": _rows(match.T_level_target),
         "T_level_source": _rows(match.T_level_source),
         "evidence": dict(match.evidence),
+        "areas": None if match.areas is None else _areas_to_dict(match.areas),
         "config": config.to_dict(),
+    }
+
+
+def _areas_to_dict(areas: Areas) -> dict[str, Any]:
+    """Return the draft by areas as plain values."""
+    drift = areas.drift
+    return {
+        "size": areas.size,
+        "agreeing": areas.agreeing,
+        "reason": areas.reason,
+        "before": areas.before,
+        "gain": areas.gain,
+        "gain_z": areas.gain_z,
+        "drift": None
+        if drift is None
+        else {
+            "T_grid_source": _rows(drift.T_grid_source),
+            "corner": _rows(drift.corner),
+            "spacing": drift.spacing,
+            "motion": _rows(drift.motion),
+        },
+        "items": [
+            {
+                "centre": _rows(area.centre),
+                "T_target_source": _rows(area.T_target_source),
+                "accepted": area.accepted,
+                "confidence": area.confidence,
+                "reason": area.reason,
+                "score": area.score,
+                "agrees": area.agrees,
+                "drift": _rows(area.drift),
+                "weight": area.weight,
+            }
+            for area in areas.items
+        ],
     }
 
 
 def read_pose(path: Path) -> Float64s:
     """Return `T_target_source` of an accepted match.json; anything else raises `InputError`."""
+    values = _read_match(path)
+    if values["accepted"] is not True:
+        reason = str(values.get("reason", "")).removeprefix("refused: ")[:500]
+        raise InputError(f"{path} is a refused match, which gives no common map ({reason})")
+    try:
+        T = np.asarray(values["T_target_source"], dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{path}: T_target_source must be four rows of four numbers") from None
+    return check_T(T, f"{path}: T_target_source")
+
+
+def read_drift(path: Path) -> DriftField | None:
+    """Return the correction that a match.json holds, None where it holds none."""
+    areas = _read_match(path).get("areas")
+    if not isinstance(areas, dict) or areas.get("drift") is None:
+        return None
+    try:
+        values = areas["drift"]
+        field = DriftField(
+            check_T(values["T_grid_source"], f"{path}: T_grid_source"),
+            np.asarray(values["corner"], dtype=np.float64),
+            float(values["spacing"]),
+            np.asarray(values["motion"], dtype=np.float64),
+        )
+    except (KeyError, TypeError, ValueError):
+        raise InputError(
+            f"{path}: areas.drift must hold T_grid_source, corner, spacing and motion in numbers"
+        ) from None
+    shape = field.motion.shape
+    whole = np.isfinite(field.motion).all() and np.isfinite(field.corner).all()
+    if field.corner.shape != (2,) or len(shape) != 3 or shape[2] != 4 or min(shape) < 2:
+        raise InputError(
+            f"{path}: areas.drift needs a corner of 2 numbers and motions (nx, ny, 4); "
+            f"{field.corner.shape} and {shape} came"
+        )
+    if not whole or not np.isfinite(field.spacing) or field.spacing <= 0:
+        raise InputError(f"{path}: areas.drift must hold finite numbers and a spacing above 0")
+    return field
+
+
+def _read_match(path: Path) -> dict[str, Any]:
+    """Return the values of a match.json; anything else raises `InputError`."""
     try:
         if path.stat().st_size > MAX_JSON:
             raise InputError(f"{path} is too large for a match.json")
@@ -98,14 +176,7 @@ def read_pose(path: Path) -> Float64s:
             f"{path} is not a match: it must hold accepted and T_target_source, as written by "
             "`commonmap match`"
         )
-    if values["accepted"] is not True:
-        reason = str(values.get("reason", "")).removeprefix("refused: ")[:500]
-        raise InputError(f"{path} is a refused match, which gives no common map ({reason})")
-    try:
-        T = np.asarray(values["T_target_source"], dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{path}: T_target_source must be four rows of four numbers") from None
-    return check_T(T, f"{path}: T_target_source")
+    return values
 
 
 def write_json(path: Path, values: object) -> None:

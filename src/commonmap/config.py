@@ -88,6 +88,17 @@ class DecideConfig:
 
 
 @dataclass(frozen=True)
+class AreasConfig:
+    """The draft by areas, each matched by itself. size: metres, edge of an area; None leaves this
+    out. Where the areas support a correction of the draft's drift, it is merged corrected."""
+
+    size: float | None = None
+
+    def __post_init__(self) -> None:
+        _require_positive("areas.size", self.size)
+
+
+@dataclass(frozen=True)
 class MergeConfig:
     """The common map and what is drawn from it.
 
@@ -147,6 +158,7 @@ class Config:
     search: SearchConfig = field(default_factory=SearchConfig)
     refine: RefineConfig = field(default_factory=RefineConfig)
     decide: DecideConfig = field(default_factory=DecideConfig)
+    areas: AreasConfig = field(default_factory=AreasConfig)
     merge: MergeConfig = field(default_factory=MergeConfig)
     compute: ComputeConfig = field(default_factory=ComputeConfig)
     seed: int = 0

@@ -16,6 +16,7 @@ from commonmap.config import Config
 from commonmap.errors import InputError
 from commonmap.frames import apply, check_points, check_T
 from commonmap.mapping.points import points_of
+from commonmap.matching.areas import match_areas
 from commonmap.matching.match import match
 from commonmap.merging.products import (
     CommonMap,
@@ -28,7 +29,7 @@ from commonmap.merging.products import (
     navigation_map,
 )
 from commonmap.metrics.table import find_metric
-from commonmap.types import Cloud, Leaves, Match, Progress, no_progress
+from commonmap.types import Cloud, DriftField, Leaves, Match, Progress, no_progress
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +54,15 @@ def match_maps(
     config = config or Config()
     find_metric(config.search.metric)
     start = time.perf_counter()
-    found = match(as_map(target), as_map(source), config=config, progress=progress)
-    seconds = time.perf_counter() - start
-    return replace(found, timings={**found.timings, "match": seconds})
+    target, source = as_map(target), as_map(source)
+    found = match(target, source, config=config, progress=progress)
+    timings = {**found.timings, "match": time.perf_counter() - start}
+    areas = None
+    if config.areas.size is not None and (found.accepted or found.rivals):
+        start = time.perf_counter()
+        areas = match_areas(target, source, found, config=config, progress=progress)
+        timings["areas"] = time.perf_counter() - start
+    return replace(found, areas=areas, timings=timings)
 
 
 def merge_maps(
@@ -111,7 +118,10 @@ def run(
     config: Config | None = None,
     progress: Progress = no_progress,
 ) -> Result:
-    """Return the match of two maps and, where it is accepted, the common map."""
+    """Return the match of two maps and, where it is accepted, the common map.
+
+    Where the draft's areas support a correction of its drift, the corrected draft is merged.
+    """
     # 1. the pose, and whether to believe it
     found = match_maps(target, source, config=config, progress=progress)
     if not found.accepted or found.T_target_source is None:
@@ -119,9 +129,24 @@ def run(
 
     # 2. the common map in the target's frame
     start = time.perf_counter()
-    common = merge_maps(target, source, found.T_target_source, config=config, progress=progress)
+    drift = found.areas.drift if found.areas is not None else None
+    draft = correct(as_map(source), drift)
+    common = merge_maps(target, draft, found.T_target_source, config=config, progress=progress)
     seconds = time.perf_counter() - start
     return Result(replace(found, timings={**found.timings, "merge": seconds}), common)
+
+
+def correct(draft: Map, drift: DriftField | None) -> Map:
+    """Return a draft's cloud with its drift taken off, ray origins too.
+
+    Where there is no drift, or the draft is an octree, whose voxels cannot be bent, as it came.
+    """
+    if drift is None or isinstance(draft, Leaves):
+        return draft
+    origin = draft.origin
+    if origin is not None:
+        origin = drift.apply(origin).astype(np.float32)
+    return replace(draft, xyz=drift.apply(draft.xyz), origin=origin)
 
 
 def as_map(map_: Map | ArrayLike) -> Map:

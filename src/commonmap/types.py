@@ -172,6 +172,90 @@ class Candidate:
 
 
 @dataclass(frozen=True, eq=False)
+class DriftField:
+    """A smooth correction of a draft that is bent by drift, in the draft's own frame.
+
+    T_grid_source: (4, 4) takes points of the source into the level frame of the grid. corner: (2,)
+    metres, middle of node [0, 0]. spacing: metres between nodes. motion: (nx, ny, 4) x, y, z in
+    metres and yaw in radians about each node, nx and ny at least 2.
+    """
+
+    T_grid_source: Float64s
+    corner: Float64s
+    spacing: float
+    motion: Float64s
+
+    def apply(self, xyz: NDArray[np.floating[Any]]) -> Float64s:
+        """Return (N, 3) corrected points of the source's frame: `T_target_source` holds for them.
+
+        The motions of the four nodes around a point are blended by its place between them (Sumner
+        et al. 2007); beyond the outermost nodes the nearest ones hold.
+        """
+        R, t = self.T_grid_source[:3, :3], self.T_grid_source[:3, 3]
+        points = np.asarray(xyz, dtype=np.float64)
+        local = (points @ R.T + t)[:, :2]
+        last = np.array(self.motion.shape[:2]) - 1
+        place = np.clip((local - self.corner) / self.spacing, 0.0, last)
+        node = np.minimum(place.astype(np.int64), last - 1)
+        share = place - node
+        moved = np.zeros((len(points), 3))
+        for step in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            weight = np.prod(np.where(step, share, 1.0 - share), axis=1)[:, None]
+            at = node + step
+            motion = self.motion[at[:, 0], at[:, 1]]
+            offset = (place - at) * self.spacing
+            turned = motion[:, 3:] * np.column_stack([-offset[:, 1], offset[:, 0]])
+            moved += weight * motion[:, :3]
+            moved[:, :2] += weight * turned
+        return np.asarray(points + moved @ R)
+
+
+@dataclass(frozen=True, eq=False)
+class Area:
+    """One area of the draft, matched by itself.
+
+    centre: (3,) of its points, target frame, at the pose of the whole. T_target_source: (4, 4) its
+    own best pose; None where too little stands in it to search. accepted, confidence, reason: the
+    verdict on that pose, as for a whole map. score: evidence, nats. agrees: its own pose is that of
+    the whole, within the distance at which the search tells two poses apart.
+    drift: (3,) metres, target frame, by which its points would be moved to lie on the base, near
+    the pose of the whole; None where too few points met the base. weight: 0 to 1, how far that
+    goes with its neighbours.
+    """
+
+    centre: Float64s
+    T_target_source: Float64s | None
+    accepted: bool
+    confidence: float
+    reason: str
+    score: float
+    agrees: bool
+    drift: Float64s | None
+    weight: float
+
+
+@dataclass(frozen=True, eq=False)
+class Areas:
+    """The draft by areas. size: metres, their edge. items: one per area that holds points.
+
+    agreeing: share of the areas searched whose own pose is that of the whole; nan where none was.
+    drift: the correction, where the areas support one; reason: one sentence that says why.
+    before: metres, mean distance of held-out areas off the base. gain: by how much less it is with
+    the drift of their neighbours taken off. gain_z: the same in standard deviations of chance
+    (signed ranks over the areas). nan where there was nothing to hold out.
+    """
+
+    size: float
+    items: tuple[Area, ...]
+    agreeing: float
+    drift: DriftField | None
+    reason: str
+    before: float
+    gain: float
+    gain_z: float
+
+
+@dataclass(frozen=True, eq=False)
 class Match:
     """The answer: where the source map lies in the target's frame, and whether to believe it.
 
@@ -188,6 +272,7 @@ class Match:
     metric: name of the similarity metric.
     evidence: named figures behind the verdict.
     timings: seconds per step.
+    areas: the draft by areas, where asked for.
     """
 
     accepted: bool
@@ -206,3 +291,4 @@ class Match:
     T_level_target: Float64s | None = None
     T_level_source: Float64s | None = None
     picture: SearchPicture | None = None
+    areas: Areas | None = None
