@@ -302,6 +302,66 @@ def odometry_command(
     return 0
 
 
+@app.command("octree")
+def octree_command(
+    source: Annotated[
+        Path, typer.Argument(metavar="LOG_OR_CLOUD", help="Raw log of a lidar, or a cloud.")
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Octree to write: .ot or .bt.")],
+    resolution: Annotated[float, typer.Option(help="Voxel size, metres.")] = 0.1,
+    max_range: Annotated[
+        float | None, typer.Option(help="Longer rays free up to here and hit nothing, metres.")
+    ] = None,
+    poses: Annotated[
+        Path | None, typer.Option("--poses", help="Known poses (TUM, KITTI, bag); else by LOAM.")
+    ] = None,
+    origin: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(metavar="X Y Z", help="Of a cloud: where the sensor stood; else ends alone."),
+    ] = None,
+    l_occ: Annotated[
+        float | None, typer.Option("--l-occ", help="Log-odds of a hit.", show_default="0.847")
+    ] = None,
+    l_free: Annotated[
+        float | None, typer.Option("--l-free", help="Log-odds of a miss.", show_default="-0.405")
+    ] = None,
+    l_min: Annotated[
+        float | None, typer.Option("--l-min", help="Least log-odds.", show_default="-2")
+    ] = None,
+    l_max: Annotated[
+        float | None, typer.Option("--l-max", help="Greatest log-odds.", show_default="3.511")
+    ] = None,
+    lazy: Annotated[
+        bool, typer.Option("--lazy", help="Leave voxels unpruned, as OctoMap's lazy mode (.ot).")
+    ] = False,
+    threads: Annotated[int, typer.Option(help="Threads; the file is the same for any.")] = 1,
+    topic: Annotated[str | None, typer.Option(help="Raw log: topic of the scans.")] = None,
+    keep_partial: KeepPartial = False,
+    quiet: Quiet = False,
+) -> int:
+    """Map a raw log or a cloud into an octree: occupied, free, unknown (Hornung et al. 2013)."""
+    from commonmap import cli_octree, cli_results
+    from commonmap.cli_progress import telling
+    from commonmap.io.octomap import write_octree
+
+    cli_results.check_file(out)
+    cli_octree.check_name(out)
+    tree = cli_octree.make_tree(
+        resolution, l_occ=l_occ, l_free=l_free, l_min=l_min, l_max=l_max, threads=threads
+    )
+    options = cli_octree.Options(max_range, poses, origin, topic, keep_partial)
+    with _notes(quiet), telling(quiet=quiet) as progress:
+        told = cli_octree.fill(tree, source, options, progress)
+        progress("write the octree")
+        leaves = tree.leaves(pruned=not lazy)
+        write_octree(out, leaves)
+    if not quiet:
+        for line in (*told, *cli_octree.describe(tree, leaves)):
+            print(line)
+        print(f"written: {out}")
+    return 0
+
+
 @app.command("demo")
 def demo_command(
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the results.")] = Path(

@@ -42,7 +42,8 @@ class Octree:
     """An occupancy octree of 16 levels that scans are inserted into (it changes in place).
 
     resolution: edge of a voxel, metres. hit, miss: occupancy probability that one hit, one miss
-    stands for. clamp_min, clamp_max: probabilities that the occupancy is kept between. The frame is
+    stands for (l_occ and l_free of the paper as log-odds). clamp_min, clamp_max: probabilities that
+    the occupancy is kept between (l_min, l_max). The frame is
     the map's; voxel keys run from 0 to 65535 and voxel 32768 begins at the origin, so that the tree
     reaches 32768 voxels each way, and what lies beyond is left out.
 
@@ -361,6 +362,11 @@ class Octree:
 def log_odds(probability: float) -> np.float32:
     """Return ln(p / (1 - p)) as OctoMap rounds it, to float32."""
     return np.float32(math.log(probability / (1.0 - probability)))
+
+
+def probability(log_odds: float) -> float:
+    """Return the probability 1 / (1 + exp(-l)) that log-odds l stand for."""
+    return 1.0 / (1.0 + math.exp(-log_odds))
 
 
 def octree_from_points(
