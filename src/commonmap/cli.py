@@ -449,12 +449,13 @@ def simulate_command(
     import numpy as np
 
     from commonmap.cli_progress import telling
+    from commonmap.sim.recording import MARGIN
     from commonmap.sim.simulate import write_simulation
 
     with _notes(quiet), telling(quiet=quiet) as progress:
         pair = write_simulation(
             out, scene, np.random.default_rng(settings.seed), overlap=overlap, drift=drift,
-            tilt=math.radians(tilt_deg), change=change, scans_every=0, seconds=seconds,
+            tilt=math.radians(tilt_deg), change=change, scans_every=0, seconds=seconds, margin=MARGIN,
             logs=[] if logs == "none" else logs.split(","), progress=progress,
         )  # fmt: skip
     if not quiet:
@@ -621,6 +622,16 @@ def _notes(quiet: bool) -> Iterator[None]:
     """Print what readers note about a file (points left out, units) as lines on stderr."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(logging.Formatter("note: %(message)s"))
+    told: set[str] = set()
+
+    def is_new(record: logging.LogRecord) -> bool:
+        # A log is read twice: once for the way, once for the map
+        text = record.getMessage()
+        fresh = text not in told
+        told.add(text)
+        return fresh
+
+    handler.addFilter(is_new)
     logger = logging.getLogger("commonmap")
     handler.setLevel(logging.ERROR if quiet else logging.INFO)
     logger.addHandler(handler)

@@ -10,7 +10,7 @@ from pathlib import Path
 from commonmap.errors import InputError
 from commonmap.io.formats import read_map
 from commonmap.io.logs import find_log, iter_scans, open_log, read_poses
-from commonmap.odometry import ODOMETRY, describe_health
+from commonmap.odometry import ODOMETRY
 from commonmap.pipeline_logs import RobotMap, map_log
 from commonmap.types import Cloud, Leaves, Progress, Trajectory
 
@@ -105,9 +105,8 @@ def take_log(path: Path, options: LogOptions, progress: Progress) -> RobotMap:
         method=method, poses=_poses(path, options) if method == "poses" else None,
         n_scans=found.n_scans, name=path.name, progress=progress,
     )  # fmt: skip
-    troubles = describe_health(robot.odometry.health)
     for note in robot.notes:
-        log.log(logging.WARNING if note in troubles else logging.INFO, "%s: %s", path.name, note)
+        log.warning("%s: %s", path.name, note)
     return robot
 
 

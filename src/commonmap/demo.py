@@ -19,7 +19,7 @@ from commonmap.pipeline import Result, run
 from commonmap.pipeline_logs import RobotMap, map_log
 from commonmap.sim.missions import Mission
 from commonmap.sim.pairs import plan_missions
-from commonmap.sim.recording import fit_truth, record, write_logs
+from commonmap.sim.recording import MARGIN, fit_truth, record, write_logs
 from commonmap.sim.vlp16 import VLP16
 from commonmap.sim.world import World
 from commonmap.types import Float64s, Progress, Scan, no_progress
@@ -68,7 +68,7 @@ def run_demo(
     """
     # 1. a drone over a place and a ground robot in it, and what their lidars record
     progress("simulate two robots")
-    plan = plan_missions(scene, rng=rng)
+    plan = plan_missions(scene, rng=rng, margin=MARGIN)
     paths = (folder / "drone" / BASE_LOG, folder / "ground_robot" / DRAFT_LOG)
     missions = (plan.flight, plan.ground)
     for path, mission, world in zip(paths, missions, (plan.world, plan.source_world), strict=True):

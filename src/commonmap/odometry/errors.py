@@ -82,4 +82,5 @@ def _over_stretches(
     E = invert(true) @ step
     metres = np.linalg.norm(E[:, :3, 3], axis=1)
     radians = np.array([angle(e) for e in E])
-    return float(np.mean(metres)) / stretch, float(np.mean(radians)) / stretch
+    length = gone[end] - gone[start]
+    return float(np.mean(metres / length)), float(np.mean(radians / length))

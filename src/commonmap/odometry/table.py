@@ -180,16 +180,26 @@ def take_poses(scans: Iterable[Scan], poses: Trajectory, progress: Progress) -> 
     progress("odometry")
     known = Trajectory(np.asarray(poses.time, np.float64), T)
     stamps, n_outside = [], 0
+    first, last = np.inf, -np.inf
     for scan in scans:
         stamps.append(scan.stamp)
         n_outside += not covers(known, scan)
+        first = min(first, float(scan.time.min(initial=scan.stamp)))
+        last = max(last, float(scan.time.max(initial=scan.stamp)))
     if n_outside == len(stamps):
         raise InputError(
             f"known poses must cover the scans ({stamps[0]:.3f} to {stamps[-1]:.3f} s); they are "
             f"of {poses.time[0]:.3f} to {poses.time[-1]:.3f} s"
         )
     outside = f"{n_outside} of {len(stamps)} turns lie outside the time of the known poses"
-    return Odometry("poses", known, (), (outside,) if n_outside else ())
+    return Odometry("poses", _cut(known, first, last), (), (outside,) if n_outside else ())
+
+
+def _cut(known: Trajectory, first: float, last: float) -> Trajectory:
+    """Return the poses of a stretch of time, with two more on either side."""
+    low = max(int(np.searchsorted(known.time, first)) - 2, 0)
+    high = int(np.searchsorted(known.time, last, side="right")) + 2
+    return Trajectory(known.time[low:high], known.T_map_sensor[low:high])
 
 
 def _run_kiss_icp(

@@ -87,7 +87,7 @@ class Plan:
 def plan_missions(
     kind: str, *, rng: np.random.Generator, seed_world: int | None = None, change: float = 0.0,
     size: float | None = None, relief: float | None = None, draft_size: float | None = None,
-    height: float | None = None, pitch: float | None = None,
+    height: float | None = None, pitch: float | None = None, margin: float = 0.0,
 ) -> Plan:  # fmt: skip
     """Return a place, a flight over all of it, and a drive in a part of it; see `simulate_pair`."""
     if seed_world is None:
@@ -100,8 +100,9 @@ def plan_missions(
     draft_area = Area(x, y, edge, edge, rng.uniform(0.0, 2 * np.pi) if room > 0.2 * edge else 0.0)
     base_area = Area(0.0, 0.0, world.size, world.size, float(rng.integers(4)) * np.pi / 2)
     ground = drive(visited, draft_area, rng)
+    span = (1.0 - 2.0 * margin) * world.size
     flight = fly(
-        world, base_area, rng,
+        world, Area(0.0, 0.0, span, span, base_area.yaw), rng,
         height=float(rng.uniform(18.0, 30.0)) if height is None else height,
         pitch=float(np.radians(rng.uniform(60.0, 90.0))) if pitch is None else pitch,
     )  # fmt: skip
@@ -125,6 +126,7 @@ def simulate_pair(
     draft_size: float | None = None,
     height: float | None = None,
     pitch: float | None = None,
+    margin: float = 0.0,
     max_range: float = 40.0,
     max_points: int = 1_500_000,
     azimuth_decimation: int = 4,
@@ -140,6 +142,8 @@ def simulate_pair(
     draft_size: metres, edge of the square that the ground robot drives in; 0.45 of the place
         unless given. size, relief: metres, of the place. height: metres, of the flight.
     pitch: radians that the drone's lidar looks down, drawn from 60 to 90 deg unless given.
+    margin: share of the place along each border that the drone does not fly over. Beyond the border
+        there is nothing, which no odometry survives that sees little else.
     max_range: metres that the ground robot's returns are kept to.
     max_points: of each cloud; more are thinned at random.
     azimuth_decimation: fire only every so many firing sequences; the drone, of which half looks
@@ -150,7 +154,7 @@ def simulate_pair(
     # 1. where each robot goes
     plan = plan_missions(
         kind, rng=rng, seed_world=seed_world, change=change, size=size, relief=relief,
-        draft_size=draft_size, height=height, pitch=pitch,
+        draft_size=draft_size, height=height, pitch=pitch, margin=margin,
     )  # fmt: skip
     world, visited, ground, flight = plan.world, plan.source_world, plan.ground, plan.flight
     base_area, draft_area = plan.base_area, plan.draft_area

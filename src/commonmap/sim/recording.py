@@ -27,6 +27,9 @@ from commonmap.types import Cloud, Float64s, Progress, Scan, Trajectory, no_prog
 TURNS = 50
 """Turns that are cast in one go: bounds the memory."""
 
+MARGIN = 0.15
+"""Share of a place along each border that a drone which needs odometry does not fly over."""
+
 LOGS = ("pcap", "mcap", "kitti")
 """Formats of raw logs, and their names in a folder."""
 

@@ -54,6 +54,7 @@ def write_simulation(
     lidar_source: str | LidarModel = "vlp16",
     size: float | None = None,
     relief: float | None = None,
+    margin: float = 0.0,
     scans_every: int = 5,
     azimuth_decimation: int = 1,
     logs: Collection[str] = (),
@@ -77,7 +78,7 @@ def write_simulation(
     pair = simulate_pair(
         kind, rng=rng, seed_world=seed_world, overlap=overlap, drift=drift, tilt=tilt,
         change=change, lidar_target=lidar_target, lidar_source=lidar_source, size=size,
-        relief=relief,
+        relief=relief, margin=margin,
     )  # fmt: skip
     models = {"uav": find_lidar(lidar_target), "ugv": find_lidar(lidar_source)}
     with writing_folder(folder, replaces=ENTRIES) as part:
