@@ -455,8 +455,8 @@ def simulate_command(
     with _notes(quiet), telling(quiet=quiet) as progress:
         pair = write_simulation(
             out, scene, np.random.default_rng(settings.seed), overlap=overlap, drift=drift,
-            tilt=math.radians(tilt_deg), change=change, scans_every=0, seconds=seconds, margin=MARGIN,
-            logs=[] if logs == "none" else logs.split(","), progress=progress,
+            tilt=math.radians(tilt_deg), change=change, scans_every=0, seconds=seconds,
+            logs=[] if logs == "none" else logs.split(","), margin=MARGIN, progress=progress,
         )  # fmt: skip
     if not quiet:
         print(f"overlap: {100 * pair.overlap:.0f} % of the draft")
