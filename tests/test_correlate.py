@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +9,7 @@ import pytest
 import scipy.signal
 from numpy.typing import NDArray
 
+import device_arrays
 from commonmap.errors import EmptyMapError, InputError, MissingExtraError
 from commonmap.matching import arrays
 from commonmap.matching.correlate import (
@@ -251,21 +251,25 @@ def test_cupy_is_an_extra(monkeypatch: pytest.MonkeyPatch) -> None:
         arrays.find_arrays("cupy")
 
 
-@pytest.mark.parametrize("name", ["k", "taneja", "zncc", "mi", "city-block", "zsad"])
-def test_the_path_of_other_array_modules(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The code that CuPy runs, run on NumPy's arrays: no compiled loops, no `workers`."""
+@pytest.mark.parametrize(("row", "reading"), CASES, ids=lambda x: getattr(x, "name", x))
+def test_the_path_of_a_gpu(row: Metric, reading: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The code that CuPy runs, on arrays as strict as CuPy's (`device_arrays`)."""
+    device_arrays.install(monkeypatch)
     (height_s, known_s), (height_t, known_t) = make_maps(12)
-    other = replace(arrays.NUMPY, name="other", threads=False)
-    expected = score_surface(
-        prepare_target(name, height_t, known_t, (6, 8), height_range=(0, TOP)), height_s, known_s
-    )
-    monkeypatch.setattr("commonmap.matching.correlate.find_arrays", lambda xp: other)
-    prepared = prepare_target(name, height_t, known_t, (6, 8), height_range=(0, TOP))
-    surface = score_surface(prepared, height_s, known_s)
-    np.testing.assert_allclose(surface.score, expected.score, atol=2e-5, rtol=1e-4)
-    _, turned = score_half_turns(prepared, height_s, known_s)
-    alone = score_surface(prepared, height_s[::-1, ::-1], known_s[::-1, ::-1])
-    np.testing.assert_allclose(turned.score, alone.score, atol=1e-4, rtol=1e-4)
+    surfaces = []
+    for xp in ("numpy", "cupy"):
+        prepared = prepare_target(
+            row, height_t, known_t, (6, 8), normalise=reading, height_range=(0, TOP), min_cells=4,
+            dtype=np.float64, xp=xp,
+        )  # fmt: skip
+        turned = score_half_turns(prepared, height_s, known_s)[1]
+        surfaces.append((score_surface(prepared, height_s, known_s, bound=True), turned))
+    for host, device in zip(*surfaces, strict=True):
+        assert type(device.score) is np.ndarray
+        assert np.isfinite(host.score).sum() > 50
+        np.testing.assert_allclose(device.score, host.score, atol=1e-9)
+        assert np.array_equal(device.n_overlap, host.n_overlap)
+    assert surfaces[1][0].bound is not None
 
 
 @pytest.mark.parametrize("name", ["k", "mi", "zncc"])

@@ -42,6 +42,9 @@ from commonmap.types import Float64s, Progress
 N_PEAKS = 6
 """Peaks kept of each yaw, over the whole target."""
 
+CONNECT_SECONDS = 10
+"""How long a Dask scheduler may take to answer."""
+
 
 @dataclass(frozen=True, eq=False)
 class Level:
@@ -342,7 +345,7 @@ def _on_cluster(address: str, tasks: Iterator[Task]) -> Iterator[Float64s]:
             "a search on a Dask cluster needs distributed: pip install 'commonmap[dask]'"
         ) from problem
     try:
-        client = distributed.Client(address, timeout=10, set_as_default=False)
+        client = distributed.Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
     except (OSError, ValueError) as problem:
         raise InputError(f"no Dask scheduler answers at {address}: {problem}") from problem
     with client:
