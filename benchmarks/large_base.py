@@ -194,7 +194,10 @@ def draw() -> None:
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.6), constrained_layout=True)
     left.loglog(area, cpu, "o-", label="search and decoy")
     line = n * np.log(n)
-    left.loglog(area, line * (cpu / line)[2], "k--", lw=1, label="n log n from 250 m")
+    # from the first size that is searched on the same coarsest cell as the largest
+    coarsest = [r["coarse_to_fine_m"][0] for r in records]
+    start = coarsest.index(coarsest[-1])
+    left.loglog(area, line * (cpu / line)[start], "k--", lw=1, label="n log n")
     for r, a, t in zip(records, area, cpu, strict=True):
         left.annotate(f"{r['coarse_to_fine_m'][0]:g} m", (a, t), (0, 6), textcoords="offset points",
                       fontsize=8, ha="center")  # fmt: skip

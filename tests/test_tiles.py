@@ -53,7 +53,7 @@ def random_grid(seed: int, shape: tuple[int, int], cell: float = 0.25) -> SlabGr
     coarse = rng.random((3, shape[0] // 4 + 1, shape[1] // 4 + 1)) < 0.3
     occupied = np.kron(coarse, np.ones((1, 4, 4), bool))[:, : shape[0], : shape[1]]
     known = np.broadcast_to(rng.random(shape) < 0.8, occupied.shape)
-    return pack_slabs(np.array([-3.0, 7.25]), cell, occupied & known, known)
+    return pack_slabs(np.array([-3.25, 7.25]), cell, occupied & known, known)
 
 
 def cut(grid: SlabGrid, rows: slice, columns: slice) -> SlabGrid:
@@ -184,12 +184,13 @@ def test_climbs_read_windows_of_a_target_too_large_to_keep() -> None:
     assert find_level(BASE, 2, IN_ONE_PIECE).whole is not None
     pose = np.array([[10.0, 20.0, 0.3], [12.0, 21.0, 0.0]])
     window, first_i, first_j = level.around(pose, 4.0)
-    # x: (10 - 4 + 3) / 0.5 = 18 and one more; y: (20 - 4 - 7) / 0.5 = 18 and one more
-    assert (first_i, first_j) == (17, 17)
-    # to (12 + 4 + 3) / 0.5 = 38 and (21 + 4 - 7) / 0.5 = 36, and two more
-    assert window.shape == (40 - 17, 38 - 17)
+    # the level begins at x = -3.5, y = 7: (10 - 4 + 3.5) / 0.5 = 19 and one cell more;
+    # (20 - 4 - 7) / 0.5 = 18 and one more
+    assert (first_i, first_j) == (18, 17)
+    # to (12 + 4 + 3.5) / 0.5 = 39 and (21 + 4 - 7) / 0.5 = 36, and two more
+    assert window.shape == (41 - 18, 38 - 17)
     whole = coarsen(BASE, 2)
-    assert np.array_equal(window.occupied, whole.occupied[17:40, 17:38])
+    assert np.array_equal(window.occupied, whole.occupied[18:41, 17:38])
     outside, _, _ = level.around(np.array([[900.0, 900.0, 0.0]]), 4.0)
     assert outside.occupied.size == 0
 
