@@ -19,6 +19,7 @@ from commonmap import cli, cli_results, pipeline
 from commonmap.errors import InputError
 from commonmap.frames import apply, difference, from_xyz_yaw, invert
 from commonmap.io import read_cloud, read_geotiff, read_map, write_cloud
+from commonmap.io.trajectory import read_trajectory
 from commonmap.types import Candidate, Cloud, Float64s, Leaves, Match
 
 T_TRUE = from_xyz_yaw(7.0, -4.0, 1.5, 2.2)
@@ -510,3 +511,114 @@ def test_simulate_checks_its_options(tmp_path: Path, run: Run) -> None:
     told(run("simulate", "-o", tmp_path / "s", "--scene", "moon", "-q"), "moon", "paper")
     told(run("demo", "-o", tmp_path / "d", "--scene", "moon", "-q"), "moon", "paper")
     assert list(tmp_path.iterdir()) == []
+
+
+# Raw logs
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with uav/log.pcap, ugv/log.mcap and the true poses, 1.5 s of each."""
+    from commonmap.sim.simulate import write_simulation
+
+    folder = tmp_path_factory.mktemp("logs") / "sim"
+    write_simulation(
+        folder, "paper", np.random.default_rng(3), size=40.0, scans_every=0, margin=0.15,
+        logs=("pcap", "mcap"), seconds=1.5,
+    )  # fmt: skip
+    return folder
+
+
+@pytest.fixture
+def placed(monkeypatch: pytest.MonkeyPatch) -> Callable[[bool], Float64s]:
+    """Return a way to have every pair of maps matched (or refused) at one pose."""
+    T = from_xyz_yaw(7.0, -4.0, 1.5, 2.2)
+
+    def put(accepted: bool) -> Float64s:
+        def matched(target: Any, source: Any, **options: Any) -> Match:
+            best = Candidate(T, 10.0, 0.9)
+            return Match(
+                accepted, "accepted: it fits" if accepted else "refused: alike",
+                T if accepted else None, 0.9, None, None, 0.9, 10.0, 1.0, (best,), "evidence",
+            )  # fmt: skip
+
+        monkeypatch.setattr(pipeline, "match", matched)
+        return T
+
+    return put
+
+
+def test_run_from_two_raw_logs(
+    logs: Path, tmp_path: Path, run: Run, placed: Callable[[bool], Float64s]
+) -> None:
+    T = placed(True)
+    out = tmp_path / "out"
+    done = run("run", logs / "uav" / "log.pcap", logs / "ugv" / "log.mcap", "-o", out)
+    assert done.code == 0, done.err
+    assert {path.name for path in out.iterdir()} == set(cli_results.ENTRIES) - {"truth.json"}
+    told_of = json.loads((out / "odometry.json").read_text(), parse_constant=pytest.fail)
+    assert told_of["base"]["turns"] == told_of["draft"]["turns"] == 15
+    assert told_of["draft"]["trajectory_frame"] == "base"
+    assert told_of["base"]["name"] == "log.pcap"
+    # the draft's way in the common frame begins where the pose puts the draft's origin
+    base = read_trajectory(out / "base_trajectory.tum")
+    draft = read_trajectory(out / "draft_trajectory.tum")
+    assert base.T_map_sensor[0, :3, 3] == pytest.approx(np.zeros(3), abs=1e-9)
+    assert draft.T_map_sensor[0, :3, 3] == pytest.approx(T[:3, 3], abs=1e-6)
+    assert read_cloud(out / "base.laz").origin is not None
+    report = (out / "report.html").read_text()
+    assert "<h2>Odometry</h2>" in report and "log.mcap" in report
+
+    placed(False)
+    done = run("run", logs / "uav" / "log.pcap", logs / "ugv" / "log.mcap", "-o", out, "-q")
+    assert done.code == 3 and done.err == ""
+    assert not (out / "common.laz").exists() and (out / "draft.laz").exists()
+    told_of = json.loads((out / "odometry.json").read_text())
+    assert told_of["draft"]["trajectory_frame"] == "the draft's own map"
+    draft = read_trajectory(out / "draft_trajectory.tum")
+    assert draft.T_map_sensor[0, :3, 3] == pytest.approx(np.zeros(3), abs=1e-9)
+
+
+def test_match_takes_a_log_and_a_map(
+    logs: Path, folder: Path, tmp_path: Path, run: Run, placed: Callable[[bool], Float64s]
+) -> None:
+    placed(True)
+    words = ("match", folder / "base.ply", logs / "ugv" / "log.mcap", "-o", tmp_path / "m.json")
+    done = run(*words, "--odometry", "poses", "-q")
+    assert done.code == 0 and done.err == ""
+    assert json.loads((tmp_path / "m.json").read_text())["source"]["size"] > 10_000
+
+
+def test_odometry_writes_the_way_and_the_map(logs: Path, tmp_path: Path, run: Run) -> None:
+    way, cloud = tmp_path / "way.tum", tmp_path / "map.laz"
+    done = run(
+        "odometry", logs / "ugv" / "log.pcap", "-o", way, "--cloud", cloud, "--truth",
+        logs / "ugv" / "truth.tum",
+    )  # fmt: skip
+    assert done.code == 0, done.err
+    assert "15 turns" in done.out and "absolute error 0.0" in done.out
+    assert len(read_trajectory(way).time) == 15
+    written = read_cloud(cloud)
+    assert len(written.xyz) > 10_000 and written.time is not None
+    # the robot stands on the ground, its lidar 0.8 m up
+    assert np.quantile(written.xyz[:, 2], 0.02) == pytest.approx(-0.8, abs=0.5)
+
+
+def test_faults_of_logs_are_one_sentence(logs: Path, tmp_path: Path, run: Run) -> None:
+    pcap, mcap = logs / "uav" / "log.pcap", logs / "ugv" / "log.mcap"
+    out = tmp_path / "way.tum"
+    told(run("odometry", pcap, "-o", out, "--odometry", "icp"), "loam, poses, kiss-icp", "'icp'")
+    told(run("odometry", pcap, "-o", out, "--odometry", "poses"), "holds no poses", "--poses FILE")
+    told(run("odometry", pcap, "-o", out, "--topic", "/x", "-q"), "no topic /x")
+    told(run("odometry", tmp_path / "none.pcap", "-o", out), "none.pcap")
+    told(run("odometry", pcap, "-o", out, "--cloud", tmp_path / "c.ot"), "file of points")
+    told(run("run", pcap, mcap, "--poses", out, "-o", tmp_path / "o"), "2 expected, 1 came")
+    broken = tmp_path / "broken.pcap"
+    broken.write_bytes(pcap.read_bytes()[:200_000])
+    told(run("odometry", broken, "-o", out, "-q"), "broken.pcap")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["broken.pcap"]
+
+
+def test_odometry_of_maps_is_told(folder: Path, tmp_path: Path, run: Run) -> None:
+    words = ("run", folder / "base.ply", folder / "draft.ply", "-o", tmp_path / "o")
+    told(run(*words, "--odometry", "loam"), "raw logs")
