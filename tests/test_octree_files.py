@@ -25,7 +25,7 @@ from commonmap.io.octomap import (
     write_octree,
 )
 from commonmap.mapping.octree import Octree
-from commonmap.types import Leaves
+from commonmap.types import Float64s, Leaves
 from octree_oracles import leaves_at, room_scan, voxels_of
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "octomap"
@@ -298,6 +298,51 @@ def test_octomap_tools_find_no_difference(tmp_path: Path) -> None:
     run("convert_octree", tmp_path / "ours.ot", tmp_path / "ours.bt")
     write_octree(tmp_path / "we.bt", tree.leaves())
     assert (tmp_path / "ours.bt").read_bytes() == (tmp_path / "we.bt").read_bytes()
+
+
+def boxes_drawn(path: Path) -> Float64s:
+    """Return x, y, z and edge (N, 4) of the occupied leaves that OctoMap's bt2vrml finds."""
+    run("bt2vrml", path)
+    words = path.with_name(path.name + ".wrl").read_text().replace("}", " ").split()
+    at = [n for n, word in enumerate(words) if word == "translation"]
+    edge = [n for n, word in enumerate(words) if word == "size"]
+    return np.array(
+        [[*words[n + 1 : n + 4], words[m + 1]] for n, m in zip(at, edge, strict=True)]
+    ).astype(float)
+
+
+def read_back(path: Path, leaves: Leaves) -> Leaves:
+    """Write leaves and return what is read from the file."""
+    write_octree(path, leaves)
+    return read_octree(path)
+
+
+def occupied_boxes(leaves: Leaves) -> Float64s:
+    """Return x, y, z and edge (N, 4) of the occupied leaves."""
+    return np.column_stack([leaves.centres(), leaves.sizes()])[leaves.occupied]
+
+
+@needs_tools
+def test_octomap_tools_draw_the_leaves_that_we_wrote(tmp_path: Path) -> None:
+    # both in the order of the file; the tool prints six digits
+    tree = Octree(0.2)
+    tree.insert((0, 0, 1.5), room_scan(np.array([0.0, 0.0, 1.5]), np.random.default_rng(7)))
+    cell = [[x, y, z] for x in (9.3, 9.5) for y in (9.3, 9.5) for z in (9.3, 9.5)]
+    tree.update(cell, occupied=True)  # eight that make one leaf of 0.4 m
+    leaves = read_back(tmp_path / "a.bt", tree.leaves())
+    drawn, ours = boxes_drawn(tmp_path / "a.bt"), occupied_boxes(leaves)
+    assert drawn.shape == ours.shape and len(ours) > 500
+    assert sorted(np.unique(ours[:, 3])) == pytest.approx([0.2, 0.4])
+    assert np.allclose(drawn, ours, atol=1e-4)
+
+
+@needs_data
+@needs_tools
+def test_octomap_tools_draw_the_office_floor_as_we_read_it(tmp_path: Path) -> None:
+    shutil.copy(DATA / "geb079.bt", tmp_path / "a.bt")
+    drawn, ours = boxes_drawn(tmp_path / "a.bt"), occupied_boxes(read_octree(tmp_path / "a.bt"))
+    assert len(drawn) == 143_729
+    assert np.allclose(drawn, ours, atol=1e-3)
 
 
 @needs_data
