@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from commonmap import frames
 from commonmap.errors import InputError
+from commonmap.io.morton import count_nodes
 from commonmap.io.octomap import read_octree, write_octree
 from commonmap.mapping.octree import Octree, log_odds
 from commonmap.merging.octrees import MERGE_RULES, merge, resample
@@ -278,6 +280,18 @@ def test_the_merged_tree_can_be_written_and_read(tmp_path: Path) -> None:
     again = read_octree(tmp_path / "m.ot")
     assert np.array_equal(again.keys, merged.leaves.keys) and again.resolution == 0.25
     assert set(np.unique(merged.provenance)) == {1, 2, 3}
+
+
+@pytest.mark.skipif(find_spec("pyoctomap") is None, reason="pyoctomap is not installed")
+def test_pyoctomap_reads_a_merged_tree(tmp_path: Path) -> None:
+    import pyoctomap
+
+    merged = merge(room(0), [(room(1), frames.from_xyz_yaw(1.0, 2.0, 0.1, 0.3))]).leaves
+    write_octree(tmp_path / "m.ot", merged)
+    peer = pyoctomap.OcTree(0.1).read(str(tmp_path / "m.ot"))
+    assert peer.size() == count_nodes(merged)
+    for centre, value in list(zip(merged.centres(), merged.log_odds, strict=True))[::97]:
+        assert peer.search(centre).getLogOdds() == value
 
 
 def test_impossible_wishes_are_refused() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from commonmap.errors import InputError
 from commonmap.io.morton import prune
-from commonmap.mapping.octree_columns import octree_columns, octree_grid
+from commonmap.mapping.octree_columns import free_heights, octree_columns, octree_grid
 from commonmap.types import Leaves
 from octree_oracles import leaves_at, voxels_of
 
@@ -93,6 +93,23 @@ def count_slowly(
                 known[s, i, j] += share
                 free[s, i, j] += share if value <= 0 else 0.0
     return occupied, free, known
+
+
+def test_free_heights_by_hand() -> None:
+    # x = 0: ground, free, free, crown, free; 1: free, unknown; 2: unknown, free; 3: occupied twice
+    f, o, u = -1.0, 1.0, np.nan
+    columns = [[o, f, f, o, f], [f, u, f, f, f], [u, f, f, f, f], [o, o, f, f, f], [f] * 5]
+    known = [(x, z, v) for x, row in enumerate(columns) for z, v in enumerate(row) if v == v]
+    leaves = leaves_at(
+        [(32768 + x, 32768, 32768 + z) for x, z, _ in known], [v for *_, v in known], 1.0
+    )
+    grid = octree_columns(
+        leaves, (0, 0), 1.0, (6, 1), ground=np.zeros((6, 1)), slab_edges=np.arange(6.0)
+    )
+    expected = [3.0, 1.0, np.nan, np.nan, 5.0, np.nan]
+    assert np.array_equal(free_heights(grid)[:, 0], expected, equal_nan=True)
+    with pytest.raises(InputError, match="slabs"):
+        free_heights(octree_columns(leaves, (0, 0), 1.0, (1, 1)))
 
 
 def test_an_occupied_voxel_between_cells_counts_once() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from commonmap.errors import InputError
-from commonmap.types import KEY_ORIGIN, Float64s, GridMap, Leaves
+from commonmap.types import KEY_ORIGIN, Float32s, Float64s, GridMap, Leaves
 
 
 def octree_columns(
@@ -72,6 +72,25 @@ def octree_columns(
     layers["known_share"] = volume[0] + volume[1]
     layers["free"] = ~occupied & (volume[0] >= known_share - 1e-6)
     return GridMap(corner, float(cell), layers, slab_edges=edges)
+
+
+def free_heights(columns: GridMap) -> Float32s:
+    """Return up to which height above ground (nx, ny) columns were seen free, NaN for not at all.
+
+    columns: of `octree_columns` with slabs. Free slabs are followed upwards without a gap from the
+    lowest one; where something stands in that one, which may be the ground, from the next. What
+    lies above is occupied or was not seen: under a canopy this is the height of the crown.
+    """
+    if columns.slab_edges is None:
+        raise InputError("free heights need slabs; these columns were made without slab_edges")
+    free, occupied = columns["free"], columns["occupied"]
+    height = np.full(free.shape[1:], np.nan, np.float32)
+    open_below = np.ones(free.shape[1:], np.bool_)
+    for slab, top in enumerate(columns.slab_edges[1:]):
+        open_here = open_below & free[slab]
+        height[open_here] = top
+        open_below = open_here | (occupied[slab] if slab == 0 else False)
+    return height
 
 
 def octree_grid(leaves: Leaves, cell: float) -> tuple[Float64s, tuple[int, int]]:
