@@ -1,4 +1,4 @@
-# make demo    simulate two robots, build their common map, say how far from the truth
+# make demo    simulate two robots' raw logs, build their common map, say how far from the truth
 # make test    the tests            make check   ruff and mypy
 # make bench   the benchmarks       make docs    the pages made from tables, and all links
 PYTHON ?= python3
