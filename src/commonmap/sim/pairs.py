@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,8 +89,12 @@ def plan_missions(
     kind: str, *, rng: np.random.Generator, seed_world: int | None = None, change: float = 0.0,
     size: float | None = None, relief: float | None = None, draft_size: float | None = None,
     height: float | None = None, pitch: float | None = None, margin: float = 0.0,
+    seconds: float | None = None,
 ) -> Plan:  # fmt: skip
-    """Return a place, a flight over all of it, and a drive in a part of it; see `simulate_pair`."""
+    """Return a place, a flight over all of it, and a drive in a part of it; see `simulate_pair`.
+
+    seconds: a robot that would be back sooner goes slower, so that it is under way for so long.
+    """
     if seed_world is None:
         seed_world = int(rng.integers(2**31))
     world = build_world(kind, np.random.default_rng(seed_world), size=size, relief=relief)
@@ -99,14 +104,29 @@ def plan_missions(
     x, y = rng.uniform(-room, room, 2)
     draft_area = Area(x, y, edge, edge, rng.uniform(0.0, 2 * np.pi) if room > 0.2 * edge else 0.0)
     base_area = Area(0.0, 0.0, world.size, world.size, float(rng.integers(4)) * np.pi / 2)
-    ground = drive(visited, draft_area, rng)
+    ground = _lasting(lambda speed: drive(visited, draft_area, rng, speed=speed), 1.2, seconds, rng)
     span = (1.0 - 2.0 * margin) * world.size
-    flight = fly(
-        world, Area(0.0, 0.0, span, span, base_area.yaw), rng,
-        height=float(rng.uniform(18.0, 30.0)) if height is None else height,
-        pitch=float(np.radians(rng.uniform(60.0, 90.0))) if pitch is None else pitch,
+    flown = Area(0.0, 0.0, span, span, base_area.yaw)
+    height = float(rng.uniform(18.0, 30.0)) if height is None else height
+    pitch = float(np.radians(rng.uniform(60.0, 90.0))) if pitch is None else pitch
+    flight = _lasting(
+        lambda speed: fly(world, flown, rng, height=height, pitch=pitch, speed=speed), 4.0,
+        seconds, rng,
     )  # fmt: skip
     return Plan(world, visited, flight, ground, base_area, draft_area, seed_world)
+
+
+def _lasting(
+    go: Callable[[float], Mission], speed: float, seconds: float | None, rng: np.random.Generator
+) -> Mission:
+    """Return the mission at a speed, or at the slower one at which it lasts for some seconds."""
+    state = rng.bit_generator.state
+    mission = go(speed)
+    while seconds is not None and np.ptp(mission.sensor.time) < seconds:
+        speed *= 0.98 * float(np.ptp(mission.sensor.time)) / seconds
+        rng.bit_generator.state = state
+        mission = go(speed)
+    return mission
 
 
 def simulate_pair(
