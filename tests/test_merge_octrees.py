@@ -229,6 +229,8 @@ def test_log_odds_of_zero_say_occupied() -> None:
     T = frames.from_xyz_yaw(0.1, 0.0, 0.0, 0.0)
     moved = resample(zero, T, 0.1)
     assert moved.occupied.all() and len(moved.depth) == 2
+    third = frames.from_xyz_yaw(0.1 / 3, 0.0, 0.0, 0.0)  # fills two thirds of A and a third of B
+    assert voxels_of(resample(leaves_at([A], [0.0]), third, 0.1)) == {A: 0.0, B: 0.0}
     torn = merge(zero, [(leaves_at([A, B], [-0.5, 0.5]), np.eye(4))], mode="occupied-wins")
     assert torn.leaves.log_odds.tolist() == [0.0, 0.5] and torn.leaves.occupied.all()
 
