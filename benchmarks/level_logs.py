@@ -1,10 +1,11 @@
+# ruff: noqa: E402 (threads are limited before numpy loads)
 """Levelling of logs: how far from level the maps of simulated robots are.
 
     python benchmarks/level_logs.py                     # six worlds, three robots, 60 s a log
 
-The logs are those of `benchmarks/odometry.py` (UGV, and UAV with its lidar 90 and 45 deg down); each
-goes through LOAM, becomes a map and is levelled, as `commonmap odometry` does it. The truth is the
-vertical of the best rigid motion between the map and the true places of its points. Told beside
+The logs are those of `benchmarks/odometry.py` (UGV, and UAV with its lidar 90 and 45 deg down);
+each goes through LOAM, becomes a map and is levelled, as `commonmap odometry` does it. The truth is
+the vertical of the best rigid motion between the map and the true places of its points. Told beside
 it: what the axis of turning alone and what upright things alone (`find_level`) give.
 Raw figures go to `benchmarks/records/level_logs.json`.
 """
