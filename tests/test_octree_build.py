@@ -81,13 +81,13 @@ def test_each_ray_begins_where_the_sensor_was_at_its_moment() -> None:
     tree = Octree(1.0)
     told: list[tuple[str, float]] = []
     left_out = insert_log(
-        scans, tree, known(line()), shift=np.array([0.0, -0.5, -0.5]), n_scans=2,
+        scans, tree, known(line()), shift=np.array([-10.0, -0.5, -0.5]), n_scans=2,
         progress=lambda step, share=0.0: told.append((step, share)),
     )  # fmt: skip
     assert left_out == 0
     got = {k: float(v) for k, v in voxels_of(tree.leaves()).items()}
     assert got == {
-        (32768 + x, 32768 + y, 32768): float(HIT if y == 2 else MISS)
+        (32778 + x, 32768 + y, 32768): float(HIT if y == 2 else MISS)
         for x in range(3)
         for y in range(3)
     }
