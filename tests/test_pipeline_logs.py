@@ -6,14 +6,16 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from commonmap import pipeline_logs
+from commonmap import pipeline, pipeline_logs
+from commonmap.demo import run_demo
 from commonmap.errors import InputError
-from commonmap.frames import invert
+from commonmap.frames import angle, from_xyz_yaw, invert
 from commonmap.io.logs.poses import interpolate
 from commonmap.odometry import Odometry, compare, estimate
 from commonmap.pipeline_logs import describe_robot, map_log
@@ -21,7 +23,7 @@ from commonmap.sim.missions import Area, Mission, drive, fly
 from commonmap.sim.recording import fit_truth, record
 from commonmap.sim.vlp16 import VLP16
 from commonmap.sim.worlds import build_world
-from commonmap.types import Scan, Trajectory
+from commonmap.types import Cloud, Match, Scan, Trajectory
 
 
 @cache
@@ -136,3 +138,30 @@ def test_the_way_is_told() -> None:
     T = interpolate(mission.sensor, made.trajectory.time)
     step = invert(T[:-1]) @ T[1:]
     assert made.way == pytest.approx(np.linalg.norm(step[:, :3, 3], axis=1).sum(), rel=0.02)
+
+
+def test_the_demo_tells_the_error_of_the_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wrong = from_xyz_yaw(3.0, 0.0, 0.0, 0.5)
+
+    def answer(target: Cloud, source: Cloud, **options: Any) -> Match:
+        return Match(
+            True, "accepted: so it is said", wrong, 0.9, None, None, 0.9, 2.0, 1.0, (), "evidence"
+        )
+
+    monkeypatch.setattr(pipeline, "match", answer)
+    shown = run_demo(tmp_path, rng=np.random.default_rng(2), seconds=2.0)
+    assert (tmp_path / "drone" / "log.pcap").exists()
+    assert (tmp_path / "ground_robot" / "log.mcap").exists()
+    assert shown.base.n_turns == shown.draft.n_turns == 20
+    assert max(e.ape for e in shown.errors) < 0.05 and max(shown.map_errors) < 0.2
+    centre = shown.draft.cloud.xyz.mean(axis=0)
+    assert shown.metres is not None and shown.radians is not None
+    moved = (wrong - shown.T_target_source) @ [*centre, 1.0]
+    assert shown.metres == pytest.approx(float(np.linalg.norm(moved)))
+    assert shown.radians == pytest.approx(angle(invert(wrong) @ shown.T_target_source), abs=1e-6)
+    # the truth takes the ground robot's ground onto the drone's, some 20 m below where it began
+    ground = np.quantile(shown.draft.cloud.xyz[:, 2], 0.05)
+    below = (shown.T_target_source @ [0.0, 0.0, ground, 1.0])[2]
+    assert -40.0 < below < -15.0
