@@ -284,7 +284,7 @@ def _field(drift: Drift, pieces: Pieces, draft: Prepared, tiling: Tiling) -> Dri
     shape = high - low + 1
     nodes = np.indices(tuple(shape)).reshape(2, -1).T + low
     at = np.column_stack([(nodes + 0.5) * tiling.size, np.zeros(len(nodes))])
-    motion, _, _ = smooth(drift.readings, pieces.centre, at, drift.prior)
+    motion, _ = smooth(drift.readings, pieces.centre, at, drift.prior)
     corner = (low + 0.5) * tiling.size
     return DriftField(draft.T_prepared_map, corner, tiling.size, motion.reshape(*shape, 4))
 

@@ -30,8 +30,16 @@ LEAST_PER_AREA = 60
 MOST_FITTED = 150
 """Areas from which the prior's parameters are taken."""
 
+DIGITS = 5
+"""Decimals of a motion. A hundredth of a millimetre is far below what is known, and far above the
+rounding of large linear systems, which differs with the threads that solve them."""
+
 N_FOLDS = 5
-"""Areas are held out by fifths; neighbours in x or y are never held out together."""
+"""Areas are held out by fifths; no two that touch are held out together."""
+
+CONTRADICTION = 16.0
+"""Squared error of an area against its neighbours, in its own variance, at which it counts half;
+chance alone gives four."""
 
 LEAST_AREAS = 8
 """Areas with a say under which no drift can be told from chance."""
@@ -98,14 +106,13 @@ class Prior:
 class Drift:
     """The drift told by the areas. motion: (A, 4) smoothed, to be added to the draft.
 
-    sigma: (A, 4) of it. readings: the areas' own. weight: (A,) 0 to 1, how far an area goes with
-    its neighbours. prior: as fitted. before: metres, how far held-out areas lie off the base as
-    they are. gain: by how much less with the drift of the other areas taken off. gain_z:
-    Wilcoxon's signed ranks of the areas' gains, in standard deviations of chance.
+    readings: the areas' own. weight: (A,) 0 to 1, how far an area goes with its neighbours.
+    prior: as fitted. before: metres, how far held-out areas lie off the base as they are. gain: by
+    how much less with the drift of the other areas taken off. gain_z: Wilcoxon's signed ranks of
+    the areas' gains, in standard deviations of chance.
     """
 
     motion: Float64s
-    sigma: Float64s
     readings: Readings
     weight: Float64s
     prior: Prior
@@ -143,13 +150,13 @@ def find_drift(base: Surface, pieces: Pieces, *, size: float, reach: float) -> D
         if np.count_nonzero(readings.heard) < LEAST_AREAS:
             return None
         prior = fit_prior(readings, pieces.centre, size)
-        motion, sigma, weight = smooth(readings, pieces.centre, pieces.centre, prior)
-    guessed = _guess_held_out(readings, pieces.centre, prior)
+        motion, weight = smooth(readings, pieces.centre, pieces.centre, prior)
+    guessed = _guess_held_out(readings, pieces.centre, prior, size)
     before, after = _compare(base, tree, pieces, guessed, reach=0.5 * reach)
     used = readings.heard & np.isfinite(before)
     gain = before[used] - after[used]
     return Drift(
-        motion, sigma, readings, weight, prior,
+        motion, readings, weight, prior,
         before=float(before[used].mean()), gain=float(gain.mean()), gain_z=_signed_ranks(gain),
     )  # fmt: skip
 
@@ -258,7 +265,7 @@ def fit_prior(readings: Readings, centre: Float64s, size: float) -> Prior:
     low = {"reach": 1.5 * size, "level": 1e-3, "climb": 1e-3, "own": 2e-3, "noise": 1.0}
     high = {"reach": max(extent, 3.0 * size), "level": 5.0, "climb": 5.0, "own": 1.0, "noise": 1e4}
     best = Prior(max(0.3 * extent, 2.0 * size), spread, spread, 0.3 * spread, 10.0)
-    value = _surprise(best, motion, information, at, np.ones(len(used)))
+    value = _surprise(best, motion, information, at)
     for factor in (4.0, 2.0, 2.0, math.sqrt(2.0)):
         for name in ("own", "noise", "level", "climb", "reach"):
             for sign in (factor, 1.0 / factor):
@@ -267,7 +274,7 @@ def fit_prior(readings: Readings, centre: Float64s, size: float) -> Prior:
                     other = replace(best, **{name: trial})
                     if trial == getattr(best, name):
                         break
-                    new = _surprise(other, motion, information, at, np.ones(len(used)))
+                    new = _surprise(other, motion, information, at)
                     if not new < value - 1e-6:
                         break
                     best, value = other, new
@@ -281,8 +288,8 @@ def smooth(
     prior: Prior,
     *,
     without: Bools | None = None,
-) -> tuple[Float64s, Float64s, Float64s]:
-    """Return (motion, sigma) (B, 4) at places `at` (B, 3), and the areas' weights (A,).
+) -> tuple[Float64s, Float64s]:
+    """Return the motions (B, 4) at places `at` (B, 3), and the areas' weights (A,).
 
     A reading that its neighbours contradict counts less (Cauchy). without: (A,) areas left out.
     """
@@ -291,34 +298,32 @@ def smooth(
     m = readings.motion[index].reshape(-1)
     K = _kernel(prior, centre[index], centre[index])
     cross = _kernel(prior, at, centre[index])
+    own = _noise(prior, readings.information[index])
     weight = np.ones(len(index))
     for _ in range(4):
-        R = _noise(prior, readings.information[index], weight)
-        factor = cho_factor(K + R, lower=True)
+        factor = cho_factor(K + _block_diagonal(own / weight[:, None, None]), lower=True)
         solved = cho_solve(factor, m)
-        # Leave-one-out errors of the areas in closed form (Rasmussen and Williams, eq. 5.12)
-        inverse = cho_solve(factor, np.eye(len(m)))
-        square = np.empty(len(index))
-        for n in range(len(index)):
-            block = slice(4 * n, 4 * n + 4)
-            square[n] = solved[block] @ np.linalg.solve(inverse[block, block], solved[block])
-        # A down-weighted area is judged by what it would be with full weight
-        weight = 1.0 / (1.0 + square * weight / (4.0 * 4.0))
-    motion = (cross @ solved).reshape(-1, 4)
-    variance = np.tile(prior.scales() ** 2, len(at)) - np.einsum(
-        "ij,ji->i", cross, cho_solve(factor, cross.T)
-    )
+        # Leave-one-out errors of the areas in closed form (Rasmussen and Williams, eq. 5.12), each
+        # judged by what it would be with full weight
+        inverse = _blocks(cho_solve(factor, np.eye(len(m))))
+        variance = np.linalg.inv(inverse)
+        error = np.einsum("nab,nb->na", variance, solved.reshape(-1, 4))
+        variance -= own * (1.0 / weight - 1.0)[:, None, None]
+        square = np.einsum("na,na->n", error, np.linalg.solve(variance, error[:, :, None])[:, :, 0])
+        weight = 1.0 / (1.0 + square / CONTRADICTION)
     weights = np.zeros(len(centre))
     weights[index] = weight
-    return motion, np.sqrt(np.maximum(variance, 0.0)).reshape(-1, 4), weights
+    motion = (cross @ solved).reshape(-1, 4)
+    return np.round(motion, DIGITS), np.round(weights, DIGITS)
 
 
-def _guess_held_out(readings: Readings, centre: Float64s, prior: Prior) -> Float64s:
+def _guess_held_out(readings: Readings, centre: Float64s, prior: Prior, size: float) -> Float64s:
     """Return each area's motion (A, 4) as the areas of the other folds have it."""
-    rank = np.arange(len(centre))
+    ij = np.floor(centre[:, :2] / size).astype(np.int64)
+    folds = (ij[:, 0] + 2 * ij[:, 1]) % N_FOLDS
     guessed = np.zeros((len(centre), 4))
     for fold in range(N_FOLDS):
-        held = rank % N_FOLDS == fold
+        held = folds == fold
         guessed[held] = smooth(readings, centre, centre[held], prior, without=held)[0]
     return guessed
 
@@ -330,23 +335,31 @@ def _kernel(prior: Prior, a: Float64s, b: Float64s) -> Float64s:
     return np.asarray(np.kron(alike, np.diag(prior.scales() ** 2)))
 
 
-def _noise(prior: Prior, information: Float64s, weight: Float64s) -> Float64s:
-    """Return the covariance (4A, 4A) of the areas' own readings, block by block."""
-    n = len(information)
-    # What its points leave open is known to a metre and to a fortieth of a turn's radian at best
+def _noise(prior: Prior, information: Float64s) -> Float64s:
+    """Return the covariances (A, 4, 4) of the areas' own readings."""
+    # What its points leave open is known to a metre and to a fortieth of a radian
     floor = np.diag([1.0, 1.0, 1.0, 1600.0])
     own = np.diag([prior.own**2] * 3 + [(prior.own / 4.0) ** 2])
-    blocks = prior.noise * np.linalg.inv(information + floor) + own
-    R = np.zeros((n, 4, n, 4))
-    R[np.arange(n), :, np.arange(n), :] = blocks / weight[:, None, None]
-    return R.reshape(4 * n, 4 * n)
+    return np.asarray(prior.noise * np.linalg.inv(information + floor) + own)
 
 
-def _surprise(
-    prior: Prior, motion: Float64s, information: Float64s, centre: Float64s, weight: Float64s
-) -> float:
+def _block_diagonal(blocks: Float64s) -> Float64s:
+    """Return the matrix (4A, 4A) with these blocks (A, 4, 4) on its diagonal."""
+    n = len(blocks)
+    out = np.zeros((n, 4, n, 4))
+    out[np.arange(n), :, np.arange(n), :] = blocks
+    return out.reshape(4 * n, 4 * n)
+
+
+def _blocks(matrix: Float64s) -> Float64s:
+    """Return the blocks (A, 4, 4) on the diagonal of a matrix (4A, 4A)."""
+    n = len(matrix) // 4
+    return np.asarray(matrix.reshape(n, 4, n, 4)[np.arange(n), :, np.arange(n), :])
+
+
+def _surprise(prior: Prior, motion: Float64s, information: Float64s, centre: Float64s) -> float:
     """Return minus the logarithm of the readings' marginal likelihood, but for a constant."""
-    C = _kernel(prior, centre, centre) + _noise(prior, information, weight)
+    C = _kernel(prior, centre, centre) + _block_diagonal(_noise(prior, information))
     m = motion.reshape(-1)
     factor = cho_factor(C, lower=True)
     return float(0.5 * m @ cho_solve(factor, m) + np.log(np.diag(factor[0])).sum())

@@ -20,9 +20,10 @@ from commonmap.mapping.ground import find_ground
 from commonmap.mapping.points import points_of
 from commonmap.merging.products import COLOURS, SOURCE, TARGET, CommonMap, Map
 from commonmap.report import pictures, tables
+from commonmap.report.areas import areas_table, areas_text, drift_figure, enlargement
 from commonmap.report.points import Box, enclose, encode, take_evenly, thin
 from commonmap.report.pose import pose_figures, static_transform_command, to_json
-from commonmap.types import Float64s, Match, SearchPicture
+from commonmap.types import Areas, Float64s, Match, SearchPicture
 from commonmap.version import __version__
 
 MAX_POINTS = 90_000
@@ -86,6 +87,7 @@ def build_page(
         _plans(base, draft, common, accepted=T is not None),
         *extra,
         _search(match, centre),
+        _areas(match.areas),
         _section(
             "Why this verdict", "All figures are of the best pose that the search found.",
             tables.evidence_table(match.evidence),
@@ -360,6 +362,22 @@ def _search(match: Match, centre: Float64s) -> str:
             "On the coarse cells with which the search begins. Dashed: the decoy's best.",
         )
         + "</div>",
+    )  # fmt: skip
+
+
+def _areas(areas: Areas | None) -> str:
+    """Return the section on the draft's areas, nothing where they were not asked for."""
+    if areas is None:
+        return ""
+    return _section(
+        "The draft by areas",
+        areas_text(areas),
+        _figure(
+            "Drift", drift_figure(areas), "",
+            "How far each area would move to lie on the base, seen from above in the base's frame; "
+            f"arrows {enlargement(areas):g} times as long as the way. Blank: too few points there.",
+        )
+        + f"<details><summary>All areas</summary>{areas_table(areas)}</details>",
     )  # fmt: skip
 
 

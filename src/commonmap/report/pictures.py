@@ -38,6 +38,16 @@ class Mark:
     strong: bool = False
 
 
+@dataclass(frozen=True)
+class Arrow:
+    """An arrow on a picture from x, y by dx, dy; data coordinates."""
+
+    x: float
+    y: float
+    dx: float
+    dy: float
+
+
 def to_png(rgba: Rgba) -> bytes:
     """Return a PNG of (rows, columns, 4) bytes, top row first."""
     rows, columns = rgba.shape[:2]
@@ -118,8 +128,9 @@ def map_figure(
     x_name: str = "x",
     y_name: str = "y",
     scale: tuple[float, float, str] | None = None,
+    arrows: Sequence[Arrow] = (),
 ) -> str:
-    """Return an SVG of a grid picture (nx, ny, 4) with axes in metres and marks.
+    """Return an SVG of a grid picture (nx, ny, 4) with axes in metres, marks and arrows.
 
     origin: (2,) data coordinates of the lower left corner. scale: (low, high, name) draws a bar of
     the viridis colours.
@@ -146,6 +157,10 @@ def map_figure(
         f'<image x="{left:.1f}" y="{top:.1f}" width="{w:.1f}" height="{h:.1f}" '
         f'preserveAspectRatio="none" href="data:image/png;base64,{data}"/>'
     )
+    for arrow in arrows:
+        u = left + (arrow.x - origin[0]) * per_metre
+        v = top + h - (arrow.y - origin[1]) * per_metre
+        parts.append(_arrow(u, v, arrow.dx * per_metre, -arrow.dy * per_metre))
     for mark in marks:
         u = left + (mark.x - origin[0]) * per_metre
         v = top + h - (mark.y - origin[1]) * per_metre
@@ -271,6 +286,21 @@ def _axes(
         f'transform="rotate(-90 {left - 42:.1f} {top + h / 2:.1f})">{escape(names[1])}</text>'
     )
     return parts
+
+
+def _arrow(u: float, v: float, du: float, dv: float) -> str:
+    length = math.hypot(du, dv)
+    if length < 0.5:  # a dot
+        return f'<circle class="mark" cx="{u:.1f}" cy="{v:.1f}" r="0.8"/>'
+    head = min(5.0, 0.5 * length) / length
+    tip_u, tip_v = u + du, v + dv
+    barbs = " ".join(
+        f"L{tip_u - head * (du + side * 0.6 * dv):.1f} {tip_v - head * (dv - side * 0.6 * du):.1f} "
+        f"L{tip_u:.1f} {tip_v:.1f}"
+        for side in (1.0, -1.0)
+    )
+    path = f"M{u:.1f} {v:.1f} L{tip_u:.1f} {tip_v:.1f} {barbs}"
+    return "".join(f'<path class="{kind}" d="{path}"/>' for kind in ("mark-under", "mark"))
 
 
 def _ring(u: float, v: float, mark: Mark) -> str:
