@@ -1,10 +1,8 @@
 """From the grid's pose to the points' pose: z in closed form, then 6-DoF registration.
 
 small_gicp (generalised ICP, Segal et al. 2009) walks from the search's peak with correspondences of
-falling reach; a robust point-to-plane solve on fixed correspondences ends it and gives what the
-answer needs to be honest: residuals area by area. Neighbouring points err together, so the areas
-count as observations and not the points: the covariance is `phi H^-1` with the overdispersion phi
-(McCullagh and Nelder 1989) that the areas show.
+falling reach; a robust point-to-plane solve ends it, first on coarse points, then on fine ones.
+What the answer is worth is measured by `covariance.py`.
 """
 
 from __future__ import annotations
@@ -19,15 +17,8 @@ from scipy.spatial.transform import Rotation
 from commonmap.frames import apply, from_rotation
 from commonmap.mapping.ground import Ground
 from commonmap.mapping.points import bounds, inside_box, move, thin
+from commonmap.matching.covariance import Pairs, Surface, measure_covariance, pair_points
 from commonmap.types import Float64s
-
-AREAS = 4
-"""Areas along the longer side of the plan that count as observations of the pose."""
-
-INFLATION = 7.0
-"""Variance is told this many times larger than the areas show: on simulated pairs without drift the
-squared normalised error was that much too large (median of 42 for 6 degrees of freedom), as what
-the two robots see of one thing differs from area to area in the same way (docs/matching.md)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +84,8 @@ def refine(
 
     target_xyz: (N, 3), source_xyz: (M, 3) metres. cell: metres, of the search. Points are thinned
     to one per voxel of a third of the cell, or coarser to stay near `n_most`. settle: end on finer
-    points. threads: with more than one the last bits differ from run to run (sums in any order).
+    points, and measure the covariance. threads: with more than one the last bits differ from run
+    to run (sums in any order).
     """
     start = np.asarray(T_target_source, dtype=np.float64)
     moved_source = move(start, source_xyz)
@@ -112,19 +104,22 @@ def refine(
     # Walk from the search's peak on coarse clouds, then settle on finer ones
     T = _walk(target, source, cell, threads)
     surface = _surface(target, voxel, threads)
-    covariance, rms = np.eye(6), float("inf")
+    spacing = voxel
     for reach in (1.5 * cell, 0.75 * cell):
-        T, covariance, rms = _solve_point_to_plane(*surface, source, T, reach=reach)
+        T, pairs = _solve_point_to_plane(surface, source, T, reach=reach)
 
     # The last centimetres come from the finest points, within reach of what the last step left
     fine = max(0.05, 0.3 * voxel)
-    reach = 4.0 * rms
-    if settle and fine < voxel and math.isfinite(rms) and reach < 0.75 * cell:
+    if settle and fine < voxel and pairs is not None and 4.0 * pairs.scale < 0.75 * cell:
+        reach, spacing = max(4.0 * pairs.scale, 2.0 * fine), fine
         surface = _surface(thin(target_xyz[inside] - centre, fine, 4 * n_most), fine, threads)
         source = thin(moved_source - centre, fine, 2 * n_most)
-        T, covariance, rms = _solve_point_to_plane(
-            *surface, source, T, reach=max(reach, 2.0 * fine)
-        )
+        T, pairs = _solve_point_to_plane(surface, source, T, reach=reach)
+    covariance, rms = np.eye(6), float("inf")
+    if pairs is not None:
+        rms = pairs.scale
+        if settle:
+            covariance = measure_covariance(surface, source, T, pairs, reach=reach, spacing=spacing)
 
     shift = float(np.linalg.norm(T[:3, 3]))
     turn = float(Rotation.from_matrix(T[:3, :3]).magnitude())
@@ -144,14 +139,16 @@ def refine(
     )
 
 
-def _surface(xyz: Float64s, voxel: float, threads: int) -> tuple[Float64s, Float64s]:
-    """Return the points and their unit normals, each (N, 3), from 20 neighbours."""
+def _surface(xyz: Float64s, voxel: float, threads: int) -> Surface:
+    """Return the points with their unit normals, from 20 neighbours."""
     import small_gicp
 
     cloud, _ = small_gicp.preprocess_points(
         xyz, downsampling_resolution=voxel / 4.0, num_neighbors=20, num_threads=threads
     )
-    return np.asarray(cloud.points())[:, :3], np.asarray(cloud.normals())[:, :3]
+    points = np.ascontiguousarray(np.asarray(cloud.points())[:, :3])
+    normals = np.ascontiguousarray(np.asarray(cloud.normals())[:, :3])
+    return Surface(points, normals, cKDTree(points, balanced_tree=False))
 
 
 def _walk(target: Float64s, source: Float64s, cell: float, threads: int) -> Float64s:
@@ -182,67 +179,20 @@ def _unrefined(start: Float64s, source_xyz: Float64s) -> Refined:
 
 
 def _solve_point_to_plane(
-    target: Float64s, normals: Float64s, source: Float64s, T: Float64s, *, reach: float
-) -> tuple[Float64s, Float64s, float]:
-    """Return (T, covariance, rms) of robust Gauss-Newton steps on point-to-plane residuals.
+    surface: Surface, source: Float64s, T: Float64s, *, reach: float
+) -> tuple[Float64s, Pairs | None]:
+    """Return (T, its pairs) after robust Gauss-Newton steps on point-to-plane residuals.
 
-    Residual `r = n . (T p - q)`, Cauchy weights scaled by its median absolute deviation. The
-    covariance counts areas of the plan as observations (`_overdispersion`).
+    The pairs are None where too few points are within reach.
     """
-    tree = cKDTree(target, balanced_tree=False)
     T = T.copy()
-    H, scale = np.eye(6), float("inf")
     for _ in range(8):
-        moved = move(T, source)
-        distance, index = tree.query(moved, distance_upper_bound=reach, workers=1)
-        hit = np.isfinite(distance)
-        if np.count_nonzero(hit) < 20:
-            return T, np.eye(6), float("inf")
-        p, n = moved[hit], normals[index[hit]]
-        r = np.einsum("ij,ij->i", n, p - target[index[hit]])
-        scale = max(1.4826 * float(np.median(np.abs(r))), 0.01)
-        w = 1.0 / (1.0 + (r / (2.0 * scale)) ** 2)
-        J = np.hstack([n, np.cross(p, n)])
-        H = (J * w[:, None]).T @ J + 1e-6 * np.eye(6) * len(p)
-        g_points = J * (w * r)[:, None]
-        step = -np.linalg.solve(H, g_points.sum(axis=0))
+        pairs = pair_points(surface, source, T, reach=reach)
+        if pairs is None:
+            return T, None
+        H = pairs.hessian() + 1e-6 * np.eye(6) * len(pairs.r)
+        step = -np.linalg.solve(H, pairs.pulls().sum(axis=0))
         T = from_rotation(Rotation.from_rotvec(step[3:]).as_matrix(), step[:3]) @ T
         if np.abs(step[:3]).max() < 1e-4 and np.abs(step[3:]).max() < 1e-5:
             break
-    covariance = INFLATION * _overdispersion(p, J, w, r) * np.linalg.inv(H)
-    # Nothing is known better than to a millimetre and a thousandth of a degree
-    covariance += np.diag([1e-3**2] * 3 + [1e-5**2] * 3)
-    return T, 0.5 * (covariance + covariance.T), scale
-
-
-def _overdispersion(
-    xyz: Float64s, J: Float64s, w: Float64s, r: Float64s, *, n_side: int = AREAS
-) -> float:
-    """Return the variance in m^2 that makes `H^-1` an honest covariance.
-
-    Every area of the plan (`n_side` along the longer side) would move by `H_a^-1 g_a` if it were
-    free. Independent noise of variance v lets `g_a^T H_a^-1 g_a / 6` be v on average; an area that
-    is drifted, bent or differently seen as a whole makes it as much larger as there are points
-    that err together.
-    """
-    low, high = xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0)
-    size = max(float((high - low).max()) / n_side, 1e-6)
-    ij = np.floor((xyz[:, :2] - low) / size).astype(np.int64)
-    _, area = np.unique(ij[:, 0] * 1024 + ij[:, 1], return_inverse=True)
-    found, weight = [], []
-    for a in range(int(area.max()) + 1):
-        inside = area == a
-        if np.count_nonzero(inside) < 30:
-            continue
-        J_a, w_a = J[inside], w[inside]
-        g = J_a.T @ (w_a * r[inside])
-        H_a = (J_a * w_a[:, None]).T @ J_a
-        H_a += 1e-3 * np.trace(H_a) / 6.0 * np.diag(np.diag(H_a) / max(np.diag(H_a).mean(), 1e-12))
-        found.append(float(g @ np.linalg.solve(H_a, g)) / 6.0)
-        weight.append(float(w_a.sum()))
-    noise = float((w * r**2).sum() / max(w.sum() - 6.0, 1.0))
-    if len(found) < 3:
-        return noise * max(1.0, len(r) / 50.0)
-    # Six parameters were fitted to the areas: what they took away is given back
-    share = max(len(found) - 1.0, 1.0) / len(found)
-    return max(noise, float(np.average(found, weights=weight)) / share)
+    return T, pairs
