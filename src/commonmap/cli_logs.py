@@ -9,7 +9,7 @@ from pathlib import Path
 
 from commonmap.errors import InputError
 from commonmap.io.formats import read_map
-from commonmap.io.logs import find_log, iter_scans, open_log, read_poses
+from commonmap.io.logs import find_log, iter_scans, open_log, read_acceleration, read_poses
 from commonmap.odometry import ODOMETRY
 from commonmap.pipeline_logs import RobotMap, map_log
 from commonmap.types import Cloud, Leaves, Progress, Trajectory
@@ -103,6 +103,7 @@ def take_log(path: Path, options: LogOptions, progress: Progress) -> RobotMap:
     robot = map_log(
         lambda: iter_scans(path, topic=options.topic, keep_partial=options.keep_partial),
         method=method, poses=_poses(path, options) if method == "poses" else None,
+        acceleration=None if method == "poses" else read_acceleration(path),
         n_scans=found.n_scans, name=path.name, progress=progress,
     )  # fmt: skip
     for note in robot.notes:

@@ -13,6 +13,7 @@ import numpy as np
 
 from commonmap.errors import InputError
 from commonmap.frames import apply
+from commonmap.io.logs.imu import Acceleration
 from commonmap.mapping.level import Levelling, no_levelling
 from commonmap.mapping.level_log import level_log
 from commonmap.odometry import (
@@ -74,6 +75,7 @@ def map_log(
     *,
     method: str = "loam",
     poses: Trajectory | None = None,
+    acceleration: Acceleration | None = None,
     max_points: int = MAX_POINTS,
     n_scans: int | None = None,
     name: str = "the log",
@@ -82,9 +84,10 @@ def map_log(
     """Return the level map of a log and the way of the sensor in it.
 
     read: gives the turns from the first on; it is called twice, and no more than a few turns are in
-        memory at a time. method: a row of `ODOMETRY`. poses: known poses of the sensor, for method
-        "poses"; the map is then in their frame, as it is. n_scans: of the log where known, for the
-        progress. name: of the log in the progress.
+        memory at a time.
+    method: a row of `ODOMETRY`. poses: known poses of the sensor, for method "poses"; the map is
+        then in their frame, as it is. acceleration: of an IMU, where the log has one.
+    n_scans: of the log where known, for the progress. name: of the log in the progress.
     """
     # 1. where the sensor was at each turn; the frame is that of the sensor at the start
     turns = _telling(read(), f"odometry of {name}", n_scans, progress)
@@ -103,7 +106,7 @@ def map_log(
     progress(f"level the map of {name}")
     levelling = no_levelling("the frame is that of the known poses")
     if method != "poses":
-        levelling = level_log(cloud, answer.trajectory)
+        levelling = level_log(cloud, answer.trajectory, acceleration)
     T = levelling.T_level_map
     answer = _turned(answer, T)
     notes = _notes(answer, levelling, counted.n_left_out)

@@ -4,7 +4,7 @@ A lidar may be mounted anyhow: a drone's looks straight down. Two things tell th
 attitude: a robot that turns does so about the vertical, a drone exactly but for its sway, a ground
 robot about the normal of the ground it stands on. And what stands upright (`mapping.level`), which
 is not misled by a slope. The attitude says it roughly, upright things exactly; where there are none
-the attitude stands.
+the attitude stands. Where the log has an IMU, what it felt takes the place of the attitude.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ import math
 import numpy as np
 
 from commonmap.frames import from_rotation, rotation_between
+from commonmap.io.logs.imu import GRAVITY, Acceleration
+from commonmap.io.logs.poses import interpolate
 from commonmap.mapping.level import Levelling, find_level
 from commonmap.mapping.points import sample
 from commonmap.types import Cloud, Float64s, Trajectory
@@ -26,12 +28,18 @@ NEAREST = 0.05
 """Share of the points, the nearest, that tell on which side of the sensor the ground is."""
 
 
-def level_log(cloud: Cloud, trajectory: Trajectory) -> Levelling:
+def level_log(
+    cloud: Cloud, trajectory: Trajectory, acceleration: Acceleration | None = None
+) -> Levelling:
     """Return the rotation about the origin that makes a log's map level.
 
     cloud: of the map, with ray origins. trajectory: of the sensor in the same frame.
+    acceleration: what an IMU felt, in the axes of the sensor, where there is one.
     """
-    up = find_turn_axis(cloud, trajectory)
+    up = None if acceleration is None else find_felt_up(trajectory, acceleration)
+    by_imu = up is not None
+    if up is None:
+        up = find_turn_axis(cloud, trajectory)
     if up is None:
         return find_level(cloud.xyz)
     R_rough = rotation_between(up, (0.0, 0.0, 1.0))
@@ -40,10 +48,33 @@ def level_log(cloud: Cloud, trajectory: Trajectory) -> Levelling:
     tilt = math.acos(float(np.clip(R[2, 2], -1.0, 1.0)))
     if math.isfinite(found.sigma):
         how = f"upright things agree within {math.degrees(found.sigma):.2f} deg"
+    elif by_imu:
+        how = "nothing upright was found; up is what the IMU felt"
     else:
         how = "nothing upright was found; up is the axis about which the sensor turned"
     reason = f"turned by {math.degrees(tilt):.2f} deg: {how}"
     return Levelling(from_rotation(R), tilt, found.sigma, reason)
+
+
+def find_felt_up(trajectory: Trajectory, acceleration: Acceleration) -> Float64s | None:
+    """Return the direction (3,) of the map against gravity, as an IMU felt it, or None.
+
+    What it felt, turned into the map by the pose of each moment and averaged, is gravity's opposite
+    plus the change of speed over the time, which the trajectory knows. A constant error of the
+    accelerometer averages out over a robot that turns. None where there are fewer than ten
+    moments, or their mean is no gravity.
+    """
+    first, last = float(trajectory.time[0]), float(trajectory.time[-1])
+    inside = (acceleration.time >= first) & (acceleration.time <= last)
+    if inside.sum() < 10 or len(trajectory.time) < 4:
+        return None
+    time, felt = acceleration.time[inside], acceleration.felt[inside]
+    R = interpolate(trajectory, time)[:, :3, :3]
+    t, at = trajectory.T_map_sensor[:, :3, 3], trajectory.time
+    gain = (t[-1] - t[-2]) / (at[-1] - at[-2]) - (t[1] - t[0]) / (at[1] - at[0])
+    up = np.einsum("nij,nj->ni", R, felt).mean(axis=0) - gain / (last - first)
+    length = float(np.linalg.norm(up))
+    return up / length if 0.5 * GRAVITY < length < 1.5 * GRAVITY else None
 
 
 def find_turn_axis(cloud: Cloud, trajectory: Trajectory) -> Float64s | None:

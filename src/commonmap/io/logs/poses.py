@@ -113,7 +113,7 @@ def _from_bag(path: Path, topic: str | None, sensor: str | None, fixed: str | No
     record = open_rosbag(path, Options())
     chosen = _choose(path, [t for t in record.topics if t.holds == "poses"], topic)
     if sensor is None:
-        sensor = _frame_of_scans(path, record.topics, record.topic)
+        sensor = frame_of_scans(path, record.topics, record.topic)
     if chosen.type in TF:
         return _from_tf(path, record.topics, sensor, fixed)
     times: list[float] = []
@@ -129,8 +129,8 @@ def _from_bag(path: Path, topic: str | None, sensor: str | None, fixed: str | No
         raise InputError(f"{path}: topic {shown(chosen.name)} holds no poses")
     T_map_child = np.array(motions)
     if child and sensor and child != sensor:
-        edges = _edges(path, record.topics, only_static=True)
-        T_child_sensor = _still(edges, child, sensor)
+        edges = edges_of(path, record.topics, only_static=True)
+        T_child_sensor = still_motion(edges, child, sensor)
         if T_child_sensor is None:
             log.warning(
                 "%s: the poses are of %s, the scans of %s, and no /tf_static joins them; they are "
@@ -157,7 +157,7 @@ def _choose(path: Path, topics: list[Topic], wanted: str | None) -> Topic:
     raise InputError(f"{path}: give the topic with the poses; it has {names}")
 
 
-def _frame_of_scans(path: Path, topics: Iterable[Topic], chosen: str | None) -> str | None:
+def frame_of_scans(path: Path, topics: Iterable[Topic], chosen: str | None) -> str | None:
     for topic in topics:
         if topic.holds == "scans" and chosen in (None, topic.name):
             for message in iter_messages(path, [topic.name]):
@@ -199,7 +199,7 @@ def _time(header: Any) -> float:
     return float(header.stamp.sec) + float(header.stamp.nanosec) * 1e-9
 
 
-def _edges(path: Path, topics: Iterable[Topic], *, only_static: bool = False) -> Edges:
+def edges_of(path: Path, topics: Iterable[Topic], *, only_static: bool = False) -> Edges:
     """Return the frames of /tf and /tf_static."""
     names = [t.name for t in topics if t.type in TF and (not only_static or "static" in t.name)]
     edges: Edges = {}
@@ -229,7 +229,7 @@ def _chain(edges: Edges, frame: str, top: str | None = None) -> list[str]:
     return chain
 
 
-def _still(edges: Edges, a: str, b: str) -> Float64s | None:
+def still_motion(edges: Edges, a: str, b: str) -> Float64s | None:
     """Return T_a_b of two frames that never move against each other, None where unknown."""
     a, b = a.lstrip("/"), b.lstrip("/")
     up_a, up_b = _chain(edges, a), _chain(edges, b)
@@ -249,7 +249,7 @@ def _still(edges: Edges, a: str, b: str) -> Float64s | None:
 def _from_tf(
     path: Path, topics: Iterable[Topic], sensor: str | None, fixed: str | None
 ) -> Trajectory:
-    edges = _edges(path, topics)
+    edges = edges_of(path, topics)
     if sensor is None or sensor.lstrip("/") not in edges:
         raise InputError(
             f"{path}: /tf does not tell where {shown(str(sensor))} is; it has "
