@@ -1,14 +1,14 @@
 """How far the verdict can be trusted: collect simulated cases, fit the model, show what it does.
 
-    python benchmarks/decision.py collect --first 0 --pairs 60     # appends to records/decision.jsonl
+    python benchmarks/decision.py collect --first 4000 --pairs 96  # appends to records/decision.jsonl
     python benchmarks/decision.py fit                              # prints the weights for decide.py
     python benchmarks/decision.py draw                             # docs/images/decision.png
-    python benchmarks/decision.py show [--from 1000]               # success, refusals, false accepts
+    python benchmarks/decision.py show [--from 4000]               # success, refusals, false accepts
 
 A case is a pair of robots in one simulated place (overlap 0.12 to 1, drift 0 to 1 %, tilt to 1
 degree, up to 30 % of the objects changed), or a draft of another place of the same or another kind.
 Every second case uses only heights under 1 m. Fit and show never use the same seeds: the fit takes
-those below 1000.
+those below 4000.
 """
 
 from __future__ import annotations
@@ -32,12 +32,19 @@ from commonmap.version import __version__
 
 KINDS = ("paper", "city", "forest", "village", "industrial", "field")
 RECORDS = Path(__file__).parent / "records" / "decision.jsonl"
-FIT_BELOW = 1000
+FIT_BELOW = 4000
 RIGHT = (1.0, np.radians(2.0))
 
 
-def simulate(seed: int) -> tuple[dict[str, Any], Any]:
-    """Return (conditions, pair) of a seed."""
+def simulate(seed: int, cache: Path | None = None) -> dict[str, Any]:
+    """Return both maps, the truth and the conditions of a seed; kept in the cache if there is one."""
+    path = cache / f"{seed}.npz" if cache else None
+    if path is not None and path.exists():
+        with np.load(path) as kept:
+            return {
+                "target": kept["t"].astype(float), "source": kept["s"].astype(float),
+                "T": kept["T"], "conditions": json.loads(str(kept["cond"])),
+            }  # fmt: skip
     rng = np.random.default_rng(seed)
     conditions: dict[str, Any] = {
         "overlap": float(rng.choice([1, 0.7, 0.45, 0.3, 0.2, 0.15])),
@@ -47,49 +54,74 @@ def simulate(seed: int) -> tuple[dict[str, Any], Any]:
     }
     kind = KINDS[seed % len(KINDS)]
     pair = simulate_pair(kind, rng=rng, max_points=500_000, **conditions)
-    return {"kind": kind, **conditions, "overlap": pair.overlap}, pair
+    conditions = {"kind": kind, **conditions, "overlap": pair.overlap}
+    # single precision in the cache and out of it: the answer must not depend on where it came from
+    target, source = pair.target.xyz.astype(np.float32), pair.source.xyz.astype(np.float32)
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        beside = path.with_suffix(".part.npz")
+        np.savez(beside, t=target, s=source, T=pair.T_target_source, cond=json.dumps(conditions))
+        beside.replace(path)
+    return {
+        "target": target.astype(float), "source": source.astype(float),
+        "T": pair.T_target_source, "conditions": conditions,
+    }  # fmt: skip
 
 
-def collect(first: int, n_pairs: int) -> None:
-    """Append the cases of `n_pairs` seeds to the records."""
+def collect(first: int, n_pairs: int, n_others: int, cache: Path | None, share: str) -> None:
+    """Append the cases of `n_pairs` seeds to the records: each base with its own draft, with
+    `n_others` drafts of other places of its kind, and with one of another kind.
+
+    share: "k/n", take only every n-th base from the k-th; several runs can share the work.
+    """
     logging.getLogger("commonmap").setLevel(logging.ERROR)
-    earlier: dict[str, Any] = {}
     RECORDS.parent.mkdir(exist_ok=True)
-    with RECORDS.open("a") as out:
-        for seed in range(first, first + n_pairs):
-            conditions, pair = simulate(seed)
-            kind = conditions["kind"]
-            other = KINDS[(seed // 6 + seed) % len(KINDS)]
-            cases = [("same place", pair.source.xyz, pair.T_target_source)]
-            if kind in earlier:
-                cases.append(("same kind", earlier[kind], None))
-            if seed % 3 == 0 and other in earlier and other != kind:
-                cases.append(("other kind", earlier[other], None))
-            for n, (label, source, truth) in enumerate(cases):
-                max_height = 1.0 if (seed + n) % 2 else None
-                config = Config().with_values(grid={"max_height": max_height})
-                start = time.perf_counter()
-                found = match(pair.target.xyz, source, config=config)
-                record = {
-                    "version": __version__, "seed": seed, "label": label, **conditions,
-                    "max_height": max_height, "accepted": found.accepted,
-                    "confidence": found.confidence, "seconds": time.perf_counter() - start,
-                    "figures": dict(found.evidence),
-                }  # fmt: skip
-                if truth is not None:
-                    best = found.T_target_source
-                    if best is None:
-                        best = found.rivals[0].T_target_source
-                    metres, radians = difference(best, truth, source.mean(axis=0))
-                    record |= {"metres": metres, "radians": radians}
-                    record["right"] = bool(metres < RIGHT[0] and radians < RIGHT[1])
-                else:
-                    record["right"] = False
+    done = set()
+    if RECORDS.exists():
+        done = {(r["seed"], r["draft"]) for r in load(first, first + n_pairs)}
+    start_at, of = (int(part) for part in share.split("/"))
+    for seed in range(first + start_at, first + n_pairs, of):
+        drafts = [seed, *(seed + len(KINDS) * (n + 1) for n in range(n_others)), seed + 1]
+        place = None
+        for n, draft in enumerate(drafts):
+            draft = first + (draft - first) % n_pairs
+            if (seed, draft) in done or (n and draft == seed):
+                continue
+            place = place or simulate(seed, cache)
+            other = place if draft == seed else simulate(draft, cache)
+            record = judge(place, other, seed, draft, 1.0 if (seed + n) % 2 else None)
+            with RECORDS.open("a") as out:
                 out.write(json.dumps(record) + "\n")
-                out.flush()
-                print(seed, kind, label, max_height, "accepted" if found.accepted else "refused",
-                      "right" if record["right"] else "-", f"{found.confidence:.3f}", flush=True)
-            earlier[kind] = pair.source.xyz
+            print(seed, draft, record["kind"], record["label"], record["max_height"],
+                  "accepted" if record["accepted"] else "refused",
+                  "right" if record["right"] else "-", f"{record['confidence']:.3f}", flush=True)
+
+
+def judge(
+    place: dict[str, Any], other: dict[str, Any], seed: int, draft: int, max_height: float | None
+) -> dict[str, Any]:
+    """Return the record of one case."""
+    config = Config().with_values(grid={"max_height": max_height})
+    start = time.process_time()
+    found = match(place["target"], other["source"], config=config)
+    kind = place["conditions"]["kind"]
+    label = "same place"
+    if draft != seed:
+        label = "same kind" if other["conditions"]["kind"] == kind else "other kind"
+    record = {
+        "version": __version__, "seed": seed, "draft": draft, "label": label,
+        **place["conditions"], "max_height": max_height, "accepted": found.accepted,
+        "confidence": found.confidence, "cpu_seconds": time.process_time() - start,
+        "figures": dict(found.evidence), "right": False,
+    }  # fmt: skip
+    if draft == seed:
+        best = found.T_target_source
+        if best is None:
+            best = found.rivals[0].T_target_source
+        metres, radians = difference(best, place["T"], other["source"].mean(axis=0))
+        record |= {"metres": metres, "radians": radians}
+        record["right"] = bool(metres < RIGHT[0] and radians < RIGHT[1])
+    return record
 
 
 def load(first: int, last: int) -> list[dict[str, Any]]:
@@ -199,10 +231,13 @@ def main() -> None:
     parser.add_argument("job", nargs="?", default="show", choices=["collect", "fit", "show", "draw"])
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--pairs", type=int, default=60)
+    parser.add_argument("--others", type=int, default=5)
+    parser.add_argument("--cache", type=Path)
+    parser.add_argument("--share", default="0/1")
     parser.add_argument("--from", dest="start", type=int, default=0)
     options = parser.parse_args()
     if options.job == "collect":
-        collect(options.first, options.pairs)
+        collect(options.first, options.pairs, options.others, options.cache, options.share)
     elif options.job == "fit":
         fit()
     elif options.job == "draw":

@@ -7,7 +7,7 @@ held-out areas lie measurably better with it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -209,8 +209,9 @@ def _match_alone(
             cell,
         )  # fmt: skip
     part = Layers(layers[1].grid, slabs)
-    figures = measure_figures(
-        layers[0], part, found, found, decoy, refined, inliers, chance, cell
+    figures = replace(
+        measure_figures(layers[0], part, found, found, decoy, refined, cell),
+        inliers=inliers, decoy_inliers=chance,
     )  # fmt: skip
     return Alone(found, refined.T_target_source, decide(figures))
 

@@ -11,7 +11,7 @@ evidence to fix a pose.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,10 @@ class Figures:
     spread: share of the evidence that is left without its best quarter of areas.
     inliers: share of the source's standing points near a standing target point, refined.
     decoy_inliers: the same at the refined pose of the mirrored source.
+    ground, decoy_ground: metres, by which the source's ground undulates against the target's at the
+        pose, and at the mirrored source's; None where too little ground is shared.
+    half_1, half_2: evidence of each half of the overlap at the pose, over that half's best at any
+        other pose; None where it was not looked for (the verdict was clear) or too little stands.
     overlap: share of the source's known cells on known cells of the target (0 to 1).
     n_overlap: the number of those cells.
     moved: refinement's step at the middle of the overlap, in cells.
@@ -48,10 +52,18 @@ class Figures:
     n_overlap: float
     moved: float
     converged: float
+    ground: float | None = None
+    decoy_ground: float | None = None
+    half_1: float | None = None
+    half_2: float | None = None
 
     def as_dict(self) -> dict[str, float]:
-        """Return the figures by name."""
-        return {name: float(value) for name, value in asdict(self).items()}
+        """Return the figures that were measured, by name."""
+        return {k: float(value) for k, value in asdict(self).items() if value is not None}
+
+
+NOTHING = Figures(*[0.0] * 14)
+"""Where the search found no pose at all."""
 
 
 @dataclass(frozen=True)
@@ -70,25 +82,68 @@ LEAST_EVIDENCE = 100.0
 """Evidence in nats under which no pose is accepted. Neighbouring cells say much the same, so an
 independent tenth of it is left, which chance among a million poses reaches once in a while."""
 
-WEIGHTS = {"bias": -8.2, "ratios": 3.1, "prominence": 2.75, "inliers": 3.4}
+WEIGHTS = {
+    "bias": -7.16, "ratios": 1.92, "prominence": 1.16, "inliers": 2.18, "ground": 1.96,
+    "halves": 3.55,
+}  # fmt: skip
 """Of the logistic model; see `features`."""
+
+QUICK_WEIGHTS = {
+    "bias": -10.17, "ratios": 3.79, "prominence": 2.08, "inliers": 4.37, "ground": 2.05,
+}  # fmt: skip
+"""Of the model without the halves, which decides where it is sure."""
+
+OPEN = (0.001, 0.9995)
+"""Between these probabilities the quick model is not sure, and the halves are looked for."""
+
+GROUND_NOISE = 0.05
+"""Metres, of what two lidars see of one ground."""
 
 
 def features(figures: Figures) -> dict[str, float]:
     """Return what the logistic model sees: logarithms of bounded ratios, and a bounded share."""
-    return {
+    seen = {
         "bias": 1.0,
         "ratios": _log(figures.decoy_ratio) + _log(figures.second_ratio),
         "prominence": math.log(max(figures.prominence, 1.0)),
-        "inliers": min(max(figures.inliers - figures.decoy_inliers, -0.2), 0.3),
+        "inliers": min(max(figures.inliers - figures.decoy_inliers, -0.2), 0.5),
+        "ground": 0.0,
     }
+    if figures.ground is not None and figures.decoy_ground is not None:
+        flatter = (figures.decoy_ground + GROUND_NOISE) / (figures.ground + GROUND_NOISE)
+        seen["ground"] = math.log(min(max(flatter, 0.4), 10.0))
+    if figures.half_1 is not None and figures.half_2 is not None:
+        seen["halves"] = sum(
+            math.log(min(max(half, 0.25), 4.0)) for half in (figures.half_1, figures.half_2)
+        )
+    return seen
+
+
+def probability(figures: Figures) -> float:
+    """Return the probability, 0 to 1, that the pose is right."""
+    x = features(figures)
+    weights = WEIGHTS if "halves" in x else QUICK_WEIGHTS
+    logit = sum(weights[name] * x[name] for name in weights)
+    return 1.0 / (1.0 + math.exp(-max(-40.0, min(40.0, logit))))
+
+
+def is_open(figures: Figures) -> bool:
+    """Return whether the figures without the halves leave the verdict open."""
+    quick = replace(figures, half_1=None, half_2=None)
+    return OPEN[0] < probability(quick) < OPEN[1]
+
+
+def rank_value(score: float, inliers: float, ground: float | None) -> float:
+    """Return what poses of one search are compared by, in logits of the model."""
+    value = 2.0 * WEIGHTS["ratios"] * math.log(max(score, 1e-9)) + WEIGHTS["inliers"] * inliers
+    if ground is not None:
+        value -= WEIGHTS["ground"] * math.log(ground + GROUND_NOISE)
+    return value
 
 
 def decide(figures: Figures) -> Verdict:
     """Return the verdict on a best pose."""
-    x = features(figures)
-    logit = sum(WEIGHTS[name] * x[name] for name in WEIGHTS)
-    confidence = 1.0 / (1.0 + math.exp(-max(-40.0, min(40.0, logit))))
+    confidence = probability(figures)
     if not figures.converged:
         confidence = min(confidence, 0.5)
         reason = "refused: the refinement on the points left the place that the search had found"

@@ -20,11 +20,12 @@ from commonmap.types import Bools, Float64s
 
 def measure_figures(
     base_layers: Layers, draft_layers: Layers, found: Peaks, witness: Peaks, decoy: Peaks,
-    refined: Refined, inliers: float, decoy_inliers: float, cell: float,
+    refined: Refined, cell: float,
 ) -> Figures:  # fmt: skip
     """Return what the verdict on the best pose of `found` rests on.
 
-    witness, decoy: peaks of the evidence, of the source as it is and mirrored.
+    witness, decoy: peaks of the evidence, of the source as it is and mirrored. What the points say
+    is left open.
     """
     grid = coarsen(base_layers.slabs, 2)
     columns = centre_columns(list_columns(draft_layers.slabs), found.centre, mirrored=False)
@@ -46,8 +47,8 @@ def measure_figures(
         effect=support.effect,
         support_t=support.t,
         spread=support.spread,
-        inliers=inliers,
-        decoy_inliers=decoy_inliers,
+        inliers=0.0,
+        decoy_inliers=0.0,
         overlap=float(found.overlap[0]),
         n_overlap=float(n_overlap),
         moved=refined.moved[0] / cell,

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TypeVar
 
 import numpy as np
 
 from commonmap.config import Config
 from commonmap.errors import EmptyMapError, InputError
 from commonmap.frames import apply, invert
-from commonmap.mapping.points import move
-from commonmap.matching.decide import Figures, Verdict, decide
+from commonmap.matching.decide import NOTHING, Figures, Verdict, decide
 from commonmap.matching.evidence import (
     SlabGrid,
     coarsen,
@@ -24,25 +21,18 @@ from commonmap.matching.evidence import (
     scatter,
     transform_target,
 )
-from commonmap.matching.figures import (
-    lift_mirrored,
-    measure_figures,
-    measure_inliers,
-    mirror,
-    other_poses,
-)
+from commonmap.matching.figures import other_poses
 from commonmap.matching.maps import (
     Layers,
-    Points,
     Prepared,
     build_layers,
     choose_grid,
-    choose_points,
     prepare,
 )
-from commonmap.matching.refine import Refined, lift, refine
+from commonmap.matching.refine import Refined, lift
 from commonmap.matching.search import Peaks, centre_columns, plan_search, search
 from commonmap.matching.search_metric import search_metric
+from commonmap.matching.verify import Maps, both, verify
 from commonmap.metrics.table import METRICS
 from commonmap.types import (
     Candidate,
@@ -54,9 +44,6 @@ from commonmap.types import (
     SearchPicture,
     no_progress,
 )
-
-First = TypeVar("First")
-Second = TypeVar("Second")
 
 WORKERS = 2
 """Threads; the answer does not depend on them."""
@@ -84,7 +71,7 @@ def match(
     # 1. each map: points, level, ground
     with _timed(timings, "prepare"):
         progress("prepare the maps")
-        base, draft = _both(
+        base, draft = both(
             lambda: prepare(target, "target", config), lambda: prepare(source, "source", config)
         )
 
@@ -92,7 +79,7 @@ def match(
     with _timed(timings, "grid"):
         progress("height maps")
         cell, edges, max_height = choose_grid(base, draft, config)
-        base_layers, draft_layers = _both(
+        base_layers, draft_layers = both(
             lambda: build_layers(base, cell, edges, max_height),
             lambda: build_layers(draft, cell, edges, max_height),
         )
@@ -110,61 +97,25 @@ def match(
             witness = _search(base_layers, draft_layers, by_evidence, False, progress)
             witness_decoy = _search(base_layers, draft_layers, by_evidence, True, progress)
 
-    # 4. z in closed form, then all six degrees of freedom on the points; and the same for the
-    #    mirrored source: how well points lie on each other at a pose that cannot be right
-    refined: Refined | None = None
-    inliers = chance = 0.0
+    # 4. z in closed form, then all six degrees of freedom on the points, of the best pose, of those
+    #    close to it, and of the mirrored source's, which cannot be right
+    refined, figures = None, NOTHING
     if len(found.score):
         with _timed(timings, "refine"):
             progress("refine")
-            points = choose_points(draft, cell, edges, max_height)
-            best, chance = _both(
-                lambda: _refine(base, draft, points, found, cell, edges, max_height),
-                lambda: _chance(base, points, witness_decoy, cell, edges, max_height),
+            maps = Maps(base, draft, base_layers, draft_layers, cell, edges, max_height)
+            found, refined, figures = verify(
+                maps, found, witness, witness_decoy, on_evidence=witness is found, workers=WORKERS
             )
-            refined, inliers = best
 
     # 5. believe it or not
     with _timed(timings, "decide"):
         progress("decide")
-        figures = Figures(*[0.0] * 14)
-        if refined is not None:
-            figures = measure_figures(
-                base_layers, draft_layers, found, witness, witness_decoy, refined, inliers, chance,
-                cell,
-            )  # fmt: skip
         verdict = decide(figures)
         if config.decide.mode == "off":
             verdict = Verdict(True, verdict.confidence, "accepted unseen, as decide.mode is off")
         picture = _draw(base_layers.slabs, draft_layers.slabs, base, draft, found, decoy, config)
     return _answer(base, draft, found, decoy, refined, figures, verdict, config, timings, picture)
-
-
-def _refine(
-    base: Prepared, draft: Prepared, points: Points, found: Peaks, cell: float, edges: Float64s,
-    max_height: float | None,
-) -> tuple[Refined, float]:  # fmt: skip
-    """Return the best pose refined, and the share of inliers there."""
-    T = lift(found.T_target_source(), base.ground, draft.ground)
-    there = choose_points(base, cell, edges, max_height, around=move(T, points.xyz))
-    refined = refine(there.xyz, points.xyz, T, cell=max(cell, found.cell))
-    return refined, measure_inliers(there, points, refined.T_target_source, cell)
-
-
-def _chance(
-    base: Prepared, points: Points, decoy: Peaks, cell: float, edges: Float64s,
-    max_height: float | None,
-) -> float:  # fmt: skip
-    """Return the share of inliers at the refined pose of the mirrored source."""
-    if len(decoy.score) == 0:
-        return 0.0
-    mirrored = mirror(points, decoy)
-    T = lift_mirrored(decoy.T_target_source(), base, mirrored)
-    there = choose_points(base, cell, edges, max_height, around=move(T, mirrored.xyz))
-    refined = refine(
-        there.xyz, mirrored.xyz, T, cell=max(cell, decoy.cell), n_most=8_000, settle=False
-    )
-    return measure_inliers(there, mirrored, refined.T_target_source, cell)
 
 
 def least_overlap(config: Config) -> float:
@@ -295,13 +246,6 @@ def _draw(
         best_per_yaw=found.per_yaw[:, 1],
         decoy_best=float(decoy.per_yaw[:, 1].max()) if len(decoy.score) else 0.0,
     )
-
-
-def _both(first: Callable[[], First], second: Callable[[], Second]) -> tuple[First, Second]:
-    """Return what both functions return, side by side."""
-    with ThreadPoolExecutor(max_workers=WORKERS) as pool:
-        one, other = pool.submit(first), pool.submit(second)
-        return one.result(), other.result()
 
 
 @contextmanager
