@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, fields, replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from commonmap.config import Config
 from commonmap.errors import EmptyMapError, InputError
-from commonmap.matching.decide import Figures, decide
+from commonmap.matching.decide import Figures, decide, is_open
 from commonmap.matching.match import match
 from commonmap.types import Cloud, Float64s, Leaves, Match
 from matching_scenes import apart, look, make_place, moved, rigid
@@ -117,7 +117,7 @@ def test_different_places_are_refused(one: int, other: int) -> None:
     assert answer.confidence < 0.9
     assert 1 <= len(answer.rivals) <= Config().search.n_rivals
     assert answer.rivals[0].T_target_source.shape == (4, 4)
-    assert set(answer.evidence) >= set(asdict(figures_of_a_good_match()))
+    assert set(answer.evidence) >= set(figures_of_a_good_match().as_dict())
 
 
 def test_a_cloud_an_array_and_bad_rows_give_one_answer(
@@ -290,6 +290,10 @@ def figure_sets() -> st.SearchStrategy[Figures]:
         moved=st.floats(0.0, 3.0),
         converged=st.just(1.0),
         evidence=st.floats(0.0, 1e5),
+        ground=st.none() | st.floats(0.0, 5.0),
+        decoy_ground=st.none() | st.floats(0.0, 5.0),
+        half_1=st.none() | ratio,
+        half_2=st.none() | ratio,
     )
 
 
@@ -308,6 +312,28 @@ def test_more_for_the_pose_never_lowers_the_confidence(
     before, after = decide(figures), decide(better)
     assert after.confidence >= before.confidence - 1e-12
     assert after.accepted or not before.accepted
+
+
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(figure_sets(), st.sampled_from(["half_1", "half_2", "ground"]), st.floats(0.2, 1.0))
+def test_halves_that_fall_apart_and_ground_that_differs_lower_the_confidence(
+    figures: Figures, name: str, share: float
+) -> None:
+    whole = replace(figures, half_1=2.0, half_2=2.0, ground=0.1, decoy_ground=1.0)
+    worse = replace(whole, **{name: 2.0 * share if name != "ground" else 0.1 / share})
+    assert decide(worse).confidence <= decide(whole).confidence
+
+
+def test_the_halves_of_a_lucky_overlap_turn_the_verdict() -> None:
+    doubtful = replace(
+        figures_of_a_good_match(), decoy_ratio=2.0, second_ratio=1.8, prominence=7.0,
+        inliers=0.6, decoy_inliers=0.3,
+    )  # fmt: skip
+    assert is_open(doubtful)
+    assert decide(replace(doubtful, half_1=2.5, half_2=2.0)).accepted
+    apart = decide(replace(doubtful, half_1=1.3, half_2=0.4))
+    assert not apart.accepted
+    assert "half" in apart.reason
 
 
 @settings(max_examples=100, deadline=None, derandomize=True)

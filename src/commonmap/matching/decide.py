@@ -178,6 +178,13 @@ def _weakness(figures: Figures) -> str:
             f"a mirrored map, which cannot match, finds almost as much evidence (ratio "
             f"{figures.decoy_ratio:.2f}); the best pose may be a coincidence"
         )
+    if figures.half_1 is not None and figures.half_2 is not None:
+        weaker = min(figures.half_1, figures.half_2)
+        if weaker < 1.0:
+            return (
+                "one half of the overlap, searched for by itself, fits better elsewhere (evidence "
+                f"ratio {weaker:.2f}); the other half alone may be a coincidence"
+            )
     if figures.support < 0.8 or figures.spread < 0.0:
         return (
             f"only {100 * figures.support:.0f} % of the draft's areas support the best pose; "

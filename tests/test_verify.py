@@ -1,0 +1,68 @@
+"""What the points and the halves of the overlap say of a pose."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from commonmap.config import Config
+from commonmap.frames import from_xyz_yaw
+from commonmap.matching.halves import measure_halves
+from commonmap.matching.maps import Points, build_layers, choose_grid, prepare
+from commonmap.matching.search import search
+from commonmap.matching.verify import ground_misfit
+from commonmap.types import Float64s
+from matching_scenes import look, make_place
+
+
+def hills(rng: np.random.Generator, lift: float = 0.0) -> Float64s:
+    """Return 40,000 points of a ground of waves a metre high, 12 m long, on 40 x 40 m."""
+    xy = rng.uniform(-20.0, 20.0, (40_000, 2))
+    z = np.sin(2.0 * np.pi * xy[:, 0] / 12.0) * np.sin(2.0 * np.pi * xy[:, 1] / 12.0)
+    return np.column_stack([xy, z + lift])
+
+
+def test_the_same_hills_fit_and_shifted_ones_do_not() -> None:
+    rng = np.random.default_rng(1)
+    off = Config().with_values(level={"mode": "off"})
+    base = prepare(hills(rng), "target", off)
+    xyz = hills(rng, lift=3.0)
+    points = Points(xyz, np.zeros(len(xyz)), np.zeros(len(xyz), bool))
+    here = base.T_prepared_map
+    fit = ground_misfit(base, points, here)
+    shifted = ground_misfit(base, points, here @ from_xyz_yaw(6.0, 0.0, 0.0, 0.0))
+    assert fit is not None and fit < 0.2  # the step of 3 m does not count
+    # waves of amplitude 1 against their opposite: twice sin sin, whose median absolute value is 0.2
+    assert shifted is not None and 0.5 < shifted < 1.2
+    away = ground_misfit(base, points, here @ from_xyz_yaw(900.0, 0.0, 0.0, 0.0))
+    assert away is None
+
+
+def halves_of(seed_target: int, seed_source: int, workers: int = 2) -> tuple[float, float] | None:
+    rng = np.random.default_rng(100 + seed_source)
+    target = look(make_place(seed_target, 40.0), rng)
+    source = look(make_place(seed_source, 40.0), rng, roofs=False, edge=24.0)
+    base, draft = prepare(target, "target", Config()), prepare(source, "source", Config())
+    cell, edges, max_height = choose_grid(base, draft, Config())
+    one, other = (build_layers(item, cell, edges, max_height).slabs for item in (base, draft))
+    found = search(one, other, min_overlap=0.1)
+    return measure_halves(one, other, found, cell, workers=workers)
+
+
+@pytest.mark.parametrize("seed", [3, 4, 5])
+def test_both_halves_of_a_right_pose_find_it_again(seed: int) -> None:
+    halves = halves_of(seed, seed)
+    assert halves is not None
+    assert min(halves) > 1.2
+
+
+@pytest.mark.parametrize("seed", [3, 4, 5])
+def test_a_lucky_overlap_falls_apart(seed: int) -> None:
+    halves = halves_of(seed, seed + 50)
+    assert halves is not None
+    assert min(halves) < 1.1
+    assert halves[0] * halves[1] < 1.6
+
+
+def test_the_halves_do_not_depend_on_the_threads() -> None:
+    assert halves_of(6, 6, workers=1) == halves_of(6, 6, workers=2)
