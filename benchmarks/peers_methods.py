@@ -32,7 +32,7 @@ CPU_LIMIT = 120
 """Seconds of CPU time after which a run counts as failed."""
 GICP_VOXEL = 0.3
 """Voxel in metres of the refinement: that of KISS-Matcher's own SLAM."""
-KISS_ACROSS, OPEN3D_ACROSS = 150, 40
+OPEN3D_ACROSS = 40
 """Voxels across the draft; the best of some tried on pairs of other seeds (docs/peers.md)."""
 
 
@@ -83,11 +83,11 @@ def refine_with_gicp(
     return np.asarray(result.T_target_source), {"gicp_inliers": int(result.num_inliers)}
 
 
-def run_kiss_matcher(target: Floats, source: Floats) -> Answer:
+def run_kiss_matcher(target: Floats, source: Floats, *, across: int) -> Answer:
     """KISS-Matcher, then small_gicp; valid from five final inliers on, as its example says."""
     import kiss_matcher
 
-    voxel = choose_voxel(source, KISS_ACROSS)
+    voxel = choose_voxel(source, across)
     config = kiss_matcher.KISSMatcherConfig(voxel, use_quatro=True)
     matcher = kiss_matcher.KISSMatcher(config)
     found = matcher.estimate(source.astype(np.float32), target.astype(np.float32))
@@ -203,11 +203,15 @@ PEERS = {
     "commonmap": Peer(
         "commonmap", run_commonmap, ("commonmap",), "as it comes", "its verdict", warm=True
     ),
-    "kiss-matcher": Peer(
-        "KISS-Matcher + small_gicp", run_kiss_matcher, ("kiss_matcher", "small_gicp"),
-        f"voxel 1/{KISS_ACROSS} of the draft's extent, Quatro, {_GICP}",
-        "5 final inliers, as in its example",
-    ),
+    **{
+        name: Peer(
+            f"KISS-Matcher, voxel 1/{across}", partial(run_kiss_matcher, across=across),
+            ("kiss_matcher", "small_gicp"),
+            f"voxel 1/{across} of the draft's extent, Quatro, {_GICP}",
+            "5 final inliers, as in its example",
+        )
+        for name, across in (("kiss-matcher", 150), ("kiss-matcher-coarse", 75))
+    },
     "open3d-ransac": Peer(
         "Open3D FPFH + RANSAC", partial(run_open3d, method="ransac"), ("open3d",),
         _OPEN3D.format("RANSAC 1.5 voxels, 100,000 iterations, 0.999"),
