@@ -22,10 +22,18 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
+from scipy.stats import beta
 
 from commonmap.config import Config
 from commonmap.frames import difference
-from commonmap.matching.decide import ACCEPT_AT, LEAST_EVIDENCE, Figures, features
+from commonmap.matching.decide import (
+    ACCEPT_AT,
+    QUICK_WEIGHTS,
+    WEIGHTS,
+    Figures,
+    decide,
+    features,
+)
 from commonmap.matching.match import match
 from commonmap.sim.pairs import simulate_pair
 from commonmap.version import __version__
@@ -130,97 +138,107 @@ def load(first: int, last: int) -> list[dict[str, Any]]:
     return [r for r in records if first <= r["seed"] < last]
 
 
-def design(records: list[dict[str, Any]]) -> tuple[list[str], np.ndarray, np.ndarray]:
-    """Return (names, X, y) of the logistic model."""
-    rows = []
-    for record in records:
-        values = {k: v for k, v in record["figures"].items() if k in Figures.__annotations__}
-        values.setdefault("evidence", record.get("score", 1000.0))
-        rows.append(features(Figures(**values)))
-    X = np.array([list(row.values()) for row in rows])
-    return list(rows[0]), X, np.array([record["right"] for record in records], dtype=float)
+def figures_of(record: dict[str, Any]) -> Figures:
+    """Return the figures of a record."""
+    return Figures(**{k: v for k, v in record["figures"].items() if k in Figures.__annotations__})
 
 
 def fit() -> None:
-    """Print the weights: ridge-regularised logistic regression."""
-    records = load(0, FIT_BELOW)
-    # Found the place but is off by a little more than allowed: neither right nor wrong
-    records = [r for r in records if r["right"] or r.get("metres", 99.0) > 1.5]
-    names, X, y = design(records)
+    """Print the weights of both models: ridge-regularised logistic regression."""
+    # Found the place but off by a little more than allowed: neither right nor wrong
+    records = [r for r in load(0, FIT_BELOW) if r["right"] or r.get("metres", 99.0) > 1.5]
+    rows = [features(figures_of(r)) for r in records]
+    y = np.array([r["right"] for r in records], dtype=float)
+    for weights in (QUICK_WEIGHTS, WEIGHTS):
+        names = list(weights)
+        X = np.array([[row.get(name, 0.0) for name in names] for row in rows])
 
-    def loss(w: np.ndarray) -> float:
-        z = X @ w
-        return float(np.sum(np.logaddexp(0, z) - y * z) + 0.1 * np.sum(w[1:] ** 2))
+        def loss(w: np.ndarray, X: np.ndarray = X) -> float:
+            z = X @ w
+            return float(np.sum(np.logaddexp(0, z) - y * z) + 0.1 * np.sum(w[1:] ** 2))
 
-    w = minimize(loss, np.zeros(X.shape[1]), method="BFGS").x
-    p = 1.0 / (1.0 + np.exp(-X @ w))
-    print(dict(zip(names, w.round(2).tolist(), strict=True)), f"from {len(y)} cases")
-    print("highest p of the wrong:", np.sort(p[y == 0])[-5:].round(3))
-    print("lowest p of the right:", np.sort(p[y == 1])[:8].round(3))
+        w = minimize(loss, np.zeros(X.shape[1]), method="BFGS").x
+        p = 1.0 / (1.0 + np.exp(-X @ w))
+        print(dict(zip(names, w.round(2).tolist(), strict=True)), f"from {len(y)} cases")
+        print("  highest p of the wrong:", np.sort(p[y == 0])[-5:].round(3))
+        print("  lowest p of the right:", np.sort(p[y == 1])[:8].round(3))
+
+
+def judged(first: int) -> dict[str, np.ndarray]:
+    """Return what today's model says of the records from `first` on, by name, an array each."""
+    records = load(first, 1 << 40)
+    verdicts = [decide(figures_of(r)) for r in records]
+    return {
+        "p": np.array([v.confidence for v in verdicts]),
+        "accepted": np.array([v.accepted for v in verdicts]),
+        "right": np.array([r["right"] for r in records]),
+        "same": np.array([r["label"] == "same place" for r in records]),
+        "kind": np.array([r["kind"] for r in records]),
+    }
+
+
+BINS = ((0, 0.02), (0.02, 0.1), (0.1, 0.5), (0.5, 0.9), (0.9, 0.99), (0.99, 1.01))
 
 
 def show(first: int) -> None:
     """Print what today's model does on the seeds from `first` on."""
-    records = load(first, 1 << 40)
-    names, X, _ = design(records)
-    from commonmap.matching.decide import WEIGHTS
-
-    p = 1.0 / (1.0 + np.exp(-X @ np.array([WEIGHTS[n] for n in names])))
-    accepted = np.array([
-        pi >= ACCEPT_AT and r["figures"]["converged"] > 0
-        and r["figures"].get("evidence", r.get("score", 1e3)) >= LEAST_EVIDENCE
-        for pi, r in zip(p, records, strict=True)
-    ])  # fmt: skip
-    right = np.array([r["right"] for r in records])
-    same = np.array([r["label"] == "same place" for r in records])
-    print(f"{len(records)} cases, {same.sum()} of the same place, {(~same).sum()} of others")
+    j = judged(first)
+    p, accepted, right, same = j["p"], j["accepted"], j["right"], j["same"]
+    print(f"{len(p)} cases, {same.sum()} of the same place, {(~same).sum()} of others")
     print(f"same place: best pose right {right.sum()}, accepted and right {(accepted & right).sum()}")
     print(f"accepted and wrong: {(accepted & ~right).sum()}")
     for kind in KINDS:
-        k = np.array([r["kind"] == kind for r in records])
+        k = j["kind"] == kind
         print(f"  {kind:11s} same {(k & same).sum():3d}  right {(k & right).sum():3d}  "
               f"accepted {(k & accepted & right).sum():3d}   other {(k & ~same).sum():3d}  "
               f"accepted {(k & accepted & ~right).sum()}")
-    print("reliability: probability, cases, share right")
-    for low, high in ((0, 0.1), (0.1, 0.5), (0.5, 0.9), (0.9, 0.99), (0.99, 1.01)):
+    print("reliability: probability told (mean), cases, share right")
+    for low, high in BINS:
         inside = (p >= low) & (p < high)
         if inside.any():
-            print(f"  {low:.2f} to {min(high, 1):.2f}  {inside.sum():4d}  {right[inside].mean():.2f}")
+            print(f"  {low:.2f} to {min(high, 1):.2f} ({p[inside].mean():.3f})  {inside.sum():4d}  "
+                  f"{right[inside].mean():.3f}")
 
 
-def draw(path: Path) -> None:
-    """Draw all cases: what they exceed a mirrored map and the second pose by, and prominence."""
+def draw(path: Path, first: int = FIT_BELOW) -> None:
+    """Draw the reliability diagram and the risk-coverage curve of the held-out cases."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    records = load(0, 1 << 40)
-    names, X, _ = design(records)
-    right = np.array([r["right"] for r in records])
-    same = np.array([r["label"] == "same place" for r in records])
-    from commonmap.matching.decide import WEIGHTS
-
-    x, y = X[:, names.index("ratios")], X[:, names.index("prominence")]
-    figure, axis = plt.subplots(figsize=(7, 4.6), dpi=110)
-    for mask, colour, marker, label in (
-        (right, "#2a78d6", "o", "same place, pose right"),
-        (same & ~right, "#d9541e", "s", "same place, pose wrong"),
-        (~same, "#6b6b6b", "x", "another place"),
-    ):
-        axis.scatter(x[mask], y[mask], s=22, c=colour, marker=marker, label=label, alpha=0.75)
-    at = np.log(ACCEPT_AT / (1 - ACCEPT_AT))
-    line = np.linspace(x.min(), x.max(), 2)
-    for inliers, style in ((0.0, "-"), (0.3, "--")):
-        edge = at - WEIGHTS["bias"] - WEIGHTS["inliers"] * inliers - WEIGHTS["ratios"] * line
-        axis.plot(line, edge / WEIGHTS["prominence"], style, color="#333333", lw=1,
-                  label=f"accepted right of here, inlier surplus {inliers:g}")
-    axis.set_ylim(0, y.max() * 1.05)
-    axis.set_xlabel("ln (best / mirrored) + ln (best / second)")
-    axis.set_ylabel("ln prominence over all headings")
-    axis.legend(fontsize=8, loc="lower right")
-    for side in ("top", "right"):
-        axis.spines[side].set_visible(False)
+    j = judged(first)
+    p, right, same = j["p"], j["right"], j["same"]
+    figure, (left, other) = plt.subplots(1, 2, figsize=(9, 4.2), dpi=110)
+    left.plot([0, 1], [0, 1], "--", color="#8a8a8a", lw=1)
+    for low, high in BINS:
+        inside = (p >= low) & (p < high)
+        if inside.any():
+            n, k = int(inside.sum()), int(right[inside].sum())
+            # Clopper and Pearson's interval
+            bounds = np.array([
+                beta.ppf(0.025, k, n - k + 1) if k else 0.0,
+                beta.ppf(0.975, k + 1, n - k) if k < n else 1.0,
+            ])  # fmt: skip
+            left.errorbar(p[inside].mean(), k / n, yerr=np.abs(bounds - k / n)[:, None], fmt="o",
+                          color="#2a78d6", capsize=3)
+            left.annotate(f"{n}", (p[inside].mean(), k / n), xytext=(6, -12),
+                          textcoords="offset points", fontsize=8)
+    left.set_xlabel("probability told")
+    left.set_ylabel("share that is right (95 %)")
+    order = np.argsort(-p, kind="stable")
+    wrong = np.cumsum(~right[order])
+    coverage = np.cumsum(right[order]) / max(same.sum(), 1)
+    other.step(coverage, wrong / np.arange(1, len(p) + 1), where="post", color="#2a78d6")
+    at = int((p[order] >= ACCEPT_AT).sum())
+    other.plot(coverage[at - 1], wrong[at - 1] / at, "o", color="#d9541e")
+    other.annotate(f"accepted from {ACCEPT_AT:g} on", (coverage[at - 1], wrong[at - 1] / at),
+                   xytext=(-110, 14), textcoords="offset points", fontsize=9)
+    other.set_xlabel("share of the pairs of one place that are told and right")
+    other.set_ylabel("share of the told that are wrong")
+    for axis in (left, other):
+        for side in ("top", "right"):
+            axis.spines[side].set_visible(False)
     figure.tight_layout()
     figure.savefig(path)
 
