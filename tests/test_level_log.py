@@ -83,3 +83,27 @@ def test_who_went_straight_has_turned_about_nothing() -> None:
     cloud = Cloud(np.ones((10, 3)), origin=np.zeros((10, 3), np.float32))
     assert find_turn_axis(cloud, turning(np.eye(3), 0.2)) is None
     assert find_turn_axis(cloud, turning(np.eye(3), 2.0)) is not None
+
+
+def test_stems_on_a_steep_slope_stand_upright() -> None:
+    """A ground robot turned about the slope's normal, 14 deg from the vertical."""
+    rng = np.random.default_rng(2)
+    R_slope = Rotation.from_euler("x", 14.0, degrees=True).as_matrix()
+    plane = np.column_stack([rng.uniform(-25, 25, (60_000, 2)), np.zeros(60_000)]) @ R_slope.T
+    foot = np.column_stack([rng.uniform(-24, 24, (120, 2)), np.zeros(120)]) @ R_slope.T
+    stem = np.repeat(foot, 400, axis=0)
+    stem[:, 2] += rng.uniform(0.0, 7.0, len(stem))
+    stem[:, :2] += 0.1 * rng.standard_normal((len(stem), 2))
+    xyz = np.concatenate([plane, stem])
+    # the map's frame is that of the sensor at the start: its z is the slope's normal
+    yaw = np.linspace(0.0, 5.0, 200)
+    R = R_slope @ Rotation.from_euler("z", yaw[:, None]).as_matrix()
+    origin = np.zeros((len(xyz), 3), np.float32) + (R_slope @ [0.0, 0.0, 0.8]).astype(np.float32)
+    cloud = Cloud(xyz @ R_slope, origin=origin @ R_slope.astype(np.float32))
+    known = Trajectory(np.arange(200.0), np.array([from_rotation(R_slope.T @ r) for r in R]))
+    axis = find_turn_axis(cloud, known)
+    assert axis == pytest.approx(np.array([0.0, 0.0, 1.0]), abs=1e-6)
+    found = level_log(cloud, known)
+    up = R_slope.T[:, 2]
+    assert math.degrees(math.acos(min(1.0, float(found.T_level_map[2, :3] @ up)))) < 0.5
+    assert "upright things agree" in found.reason

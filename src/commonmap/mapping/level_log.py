@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from commonmap.frames import from_rotation, rotation_between
 from commonmap.io.logs.imu import GRAVITY, Acceleration
@@ -26,6 +27,13 @@ straight ahead has turned about nothing."""
 
 NEAREST = 0.05
 """Share of the points, the nearest, that tell on which side of the sensor the ground is."""
+
+
+AROUND = math.radians(10.0)
+"""How far from the axis of turning upright things are looked for again."""
+
+CLEAR = math.radians(0.5)
+"""There the parts of the map must agree this well (standard error)."""
 
 
 def level_log(
@@ -44,6 +52,8 @@ def level_log(
         return find_level(cloud.xyz)
     R_rough = rotation_between(up, (0.0, 0.0, 1.0))
     found = find_level(cloud.xyz @ R_rough.T)
+    if not math.isfinite(found.sigma) and not by_imu:
+        R_rough, found = _look_around(cloud, R_rough, found)
     R = found.T_level_map[:3, :3] @ R_rough
     tilt = math.acos(float(np.clip(R[2, 2], -1.0, 1.0)))
     if math.isfinite(found.sigma):
@@ -54,6 +64,22 @@ def level_log(
         how = "nothing upright was found; up is the axis about which the sensor turned"
     reason = f"turned by {math.degrees(tilt):.2f} deg: {how}"
     return Levelling(from_rotation(R), tilt, found.sigma, reason)
+
+
+def _look_around(cloud: Cloud, R_rough: Float64s, found: Levelling) -> tuple[Float64s, Levelling]:
+    """Return rough rotation and levelling where upright things agree best, if they do so clearly.
+
+    A ground robot on a steep slope turned about the slope's normal, farther from the vertical than
+    `find_level` looks: it is asked again from directions around that normal.
+    """
+    best = (R_rough, found)
+    for turn in np.arange(6) * math.pi / 3.0:
+        axis = AROUND * np.array([math.cos(turn), math.sin(turn), 0.0])
+        R = Rotation.from_rotvec(axis).as_matrix() @ R_rough
+        again = find_level(cloud.xyz @ R.T)
+        if again.sigma < min(best[1].sigma, CLEAR):
+            best = (R, again)
+    return best
 
 
 def find_felt_up(trajectory: Trajectory, acceleration: Acceleration) -> Float64s | None:
