@@ -261,7 +261,7 @@ def test_the_corrected_draft_is_what_is_merged(monkeypatch: pytest.MonkeyPatch) 
 
 
 def make_areas() -> Areas:
-    """Return two areas, one that would move by 0.2 m along x, one with a pose of its own."""
+    """Return three areas: one would move by 0.2 m along x, one has another pose, one no drift."""
     here = Area(
         np.array([5.0, 5.0, 0.0]), np.eye(4), True, 0.95, "accepted: x", 300.0, True,
         np.array([0.2, 0.0, 0.0]), 0.9,
@@ -269,13 +269,14 @@ def make_areas() -> Areas:
     there = Area(
         np.array([15.0, 5.0, 0.0]), rigid(50, 0, 0, 0), True, 0.93, "<b>", 200.0, False, None, 0.0
     )
-    return Areas(10.0, (here, there), 0.5, None, "no correction: too few", 0.1, 0.0, 0.0)
+    also = replace(here, centre=np.array([25.0, 5.0, 0.0]), drift=None)
+    return Areas(10.0, (here, there, also), 2 / 3, None, "no correction: too few", 0.1, 0.0, 0.0)
 
 
 def test_report_draws_the_drift() -> None:
     areas = make_areas()
     assert enlargement(areas) == 50.0  # 0.2 m drawn as 10 m
-    assert "1 find the pose of the whole" in areas_text(areas)
+    assert "2 find the pose of the whole" in areas_text(areas)
     picture = drift_figure(areas)
     assert picture.count('<path class="mark"') == 1
     assert picture.count(">elsewhere<") == 1

@@ -100,6 +100,11 @@ class Tiling:
         return np.where(inside, table[tuple(np.clip(at, 0, shape - 1).T)], -1)
 
 
+def tile(xyz: Float64s, size: float) -> Tiling:
+    """Return the areas of `size` metres that hold any of (N, 3) points."""
+    return Tiling(np.unique(np.floor(xyz[:, :2] / size).astype(np.int64), axis=0), size)
+
+
 def match_areas(
     target: Cloud | Leaves | Float64s,
     source: Cloud | Leaves | Float64s,
@@ -137,8 +142,7 @@ def match_areas(
 
     # 2. the areas of the draft's plan that hold points: (A, 2)
     half = layers[1].slabs.cell
-    size = max(round(config.areas.size / half), 1) * half
-    tiling = Tiling(np.unique(np.floor(points.xyz[:, :2] / size).astype(np.int64), axis=0), size)
+    tiling = tile(points.xyz, max(round(config.areas.size / half), 1) * half)
 
     # 3. each by itself on the whole base: pose, score and verdict
     there = choose_points(base, cell, edges, max_height)
@@ -147,22 +151,22 @@ def match_areas(
     for n, ij in enumerate(tiling.ij):
         progress("areas by themselves", n / len(tiling.ij))
         own = Points(*(part[area_of == n] for part in (points.xyz, points.height, points.standing)))
-        alone.append(_match_alone(base, draft, layers, there, own, ij, size, cell))
+        alone.append(_match_alone(base, draft, layers, there, own, ij, tiling.size, cell))
 
     # 4. how the draft is bent, told by areas near the pose of the whole: (A, 4)
     progress("drift")
     bent, centre = None, _centres(points, tiling, area_of)
     if found.accepted:
-        bent = _find_drift(base, draft, T_prepared, tiling, cell)
+        bent = lay_on_base(base, draft, T_prepared, tiling, cell)
     items = []
     for n, one in enumerate(alone):
         items.append(_item(one, bent, tiling, n, centre[n], base, draft, T_prepared, cell))
     searched = [one for one in items if one.T_target_source is not None]
     return Areas(
-        size=size,
+        size=tiling.size,
         items=tuple(items),
         agreeing=float(np.mean([one.agrees for one in searched])) if searched else float("nan"),
-        drift=_field(bent[0], bent[1], draft, tiling) if bent and bent[0].supported else None,
+        drift=make_field(bent[0], bent[1], draft, tiling) if bent and bent[0].supported else None,
         reason=_reason(found.accepted, bent[0] if bent else None),
         before=bent[0].before if bent else NO_GAIN,
         gain=bent[0].gain if bent else NO_GAIN,
@@ -239,7 +243,7 @@ def _centres(points: Points, tiling: Tiling, area_of: Index) -> Float64s:
     return np.asarray(np.column_stack(sums) / count[:, None])
 
 
-def _find_drift(
+def lay_on_base(
     base: Prepared, draft: Prepared, T_base_draft: Float64s, tiling: Tiling, cell: float
 ) -> tuple[Drift, Pieces, Index] | None:
     """Return the drift, the pieces it was told by, and the area of each piece."""
@@ -279,7 +283,7 @@ def _pieces(own: Surface, tiling: Tiling) -> tuple[Pieces, Index]:
     return Pieces(Surface(own.xyz[chosen], own.normal[chosen]), labels, centre), areas_of
 
 
-def _field(drift: Drift, pieces: Pieces, draft: Prepared, tiling: Tiling) -> DriftField:
+def make_field(drift: Drift, pieces: Pieces, draft: Prepared, tiling: Tiling) -> DriftField:
     """Return the drift at all nodes of the grid, one area more on every side."""
     low, high = tiling.ij.min(axis=0) - 1, tiling.ij.max(axis=0) + 1
     shape = high - low + 1
