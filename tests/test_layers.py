@@ -19,8 +19,11 @@ LAYERS = (
     ("merging",),
     ("sim",),
     ("pipeline", "pipeline_logs", "demo"),
-    ("study", "report", "cli", "cli_logs", "cli_octree", "cli_progress", "cli_results", "__init__"),
-)
+    (
+        "study", "report", "cli", "cli_logs", "cli_octree", "cli_progress", "cli_results",
+        "cli_study", "__init__",
+    ),
+)  # fmt: skip
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 MODULES = sorted(ROOT.rglob("*.py"))
 

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
+from commonmap.cli_study import study_app
 from commonmap.errors import CommonmapError, InputError
 from commonmap.version import __version__
 
@@ -41,6 +42,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
+app.add_typer(study_app, name="study")
 
 Base = Annotated[
     Path, typer.Argument(metavar="BASE", help="The map whose frame stays (the drone's).")

@@ -1,0 +1,1 @@
+"""Experiments: the source paper's, and which metric to use. A command of `commonmap study` each."""
