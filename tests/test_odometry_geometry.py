@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -326,6 +326,7 @@ def test_bisquare_gives_outliers_no_weight() -> None:
 
 
 @given(seeds, st.integers(1, 8))
+@example(6791955, 1)  # rounded to float32 a point lies in the next voxel
 @settings(max_examples=15, deadline=None)
 def test_the_map_agrees_with_a_dictionary(seed: int, per_voxel: int) -> None:
     rng = np.random.default_rng(seed)
@@ -334,9 +335,9 @@ def test_the_map_agrees_with_a_dictionary(seed: int, per_voxel: int) -> None:
     for part in np.array_split(points, 3):
         local.insert(part)
     twin: dict[tuple[int, ...], list[np.ndarray]] = {}
-    for p in points:
+    for p in points.astype(np.float32).astype(np.float64):
         kept = twin.setdefault(tuple(np.floor(p / 0.5).astype(int)), [])
-        near = any(((q.astype(np.float32) - p) ** 2).sum() < local.apart**2 for q in kept)
+        near = any(((q - p) ** 2).sum() < local.apart**2 for q in kept)
         if len(kept) < per_voxel and not near:
             kept.append(p)
     expected = np.array([p for kept in twin.values() for p in kept], dtype=np.float32)

@@ -45,7 +45,7 @@ class LocalMap:
         return sum(a.nbytes for a in (self.keys, self.count, self.points, self.table))
 
     def insert(self, points: Float64s) -> None:
-        """Add (N, 3) points of the map frame."""
+        """Add (N, 3) points of the map frame, rounded to float32."""
         done = 0
         while True:
             done, self.n = _insert(
@@ -107,10 +107,15 @@ def find(key, keys, table):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _insert(points, first, factor, apart2, keys, count, kept, table, n):  # type: ignore[no-untyped-def]
-    """Insert points from `first` on; return (points done, voxels), early where room runs out."""
+    """Insert points from `first` on; return (points done, voxels), early where room runs out.
+
+    A point belongs to the voxel in which it lies as it is kept, rounded to float32.
+    """
     room = kept.shape[1]
     for p in range(first, points.shape[0]):
-        x, y, z = points[p, 0], points[p, 1], points[p, 2]
+        x = np.float64(np.float32(points[p, 0]))
+        y = np.float64(np.float32(points[p, 1]))
+        z = np.float64(np.float32(points[p, 2]))
         key = pack(
             np.int64(np.floor(x * factor)),
             np.int64(np.floor(y * factor)),
