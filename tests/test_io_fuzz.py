@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import struct
 import tempfile
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
@@ -176,3 +178,18 @@ def test_any_bytes_behind_a_true_beginning(kind: str, data: bytes) -> None:
         with pytest.raises(CommonmapError):
             read(path)
             raise CommonmapError("read as a map: fine too")
+
+
+def test_a_member_of_an_archive_takes_no_more_than_its_file_holds(tmp_path: Path) -> None:
+    path = tmp_path / "map.npz"
+    write_cloud(path, CLOUD)
+    data = bytearray(path.read_bytes())
+    at = data.rindex(b"PK\x01\x02")  # what the directory says of the last member
+    data[at + 20 : at + 28] = struct.pack("<II", 800_000_000, 800_000_000)
+    path.write_bytes(data)
+    tracemalloc.start()
+    with contextlib.suppress(CommonmapError):
+        read_map(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 10_000_000

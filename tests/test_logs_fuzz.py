@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-import shutil
+import resource
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,80 +15,25 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from commonmap.errors import CommonmapError
-from commonmap.io.logs import iter_scans, read_poses
+from commonmap.io.logs import iter_scans
 from commonmap.io.velodyne import PACKET_BYTES, TurnReader
-from commonmap.sim.logs import velodyne_packets, write_kitti, write_mcap, write_pcap
-from commonmap.types import Trajectory
-from lidar_scans import vlp16_scans
-from log_files import write_bag1, write_ng, write_sqlite
+from commonmap.sim.logs import velodyne_packets
+from fuzzing import LOGS, POSE_FILES, SPARSE, Victim, jobs_on_log, jobs_on_poses
 
 N = int(os.environ.get("COMMONMAP_FUZZ", "40"))
-"""Damaged copies of each file; the issue's 10,000 are run by hand."""
+"""Damaged copies of each file here; `benchmarks/fuzz_readers.py` reads 10,000 and measures."""
 
 SLOW = 5.0
 """Seconds no file of this size may take, on a busy machine."""
 
-SPARSE = vlp16_scans(2, every=150, start=1_700_000_000.0)
-POSES = Trajectory(np.linspace(1_700_000_000.0, 1_700_000_000.2, 5), np.tile(np.eye(4), (5, 1, 1)))
+DATA = 6 << 30
+"""Bytes of address space of the process: a length that is believed without a look breaks it."""
 
 
-def _zstd(path: Path) -> None:
-    write_mcap(path, SPARSE)
-    from log_files import write_mcap_zstd
-
-    path.unlink()
-    write_mcap_zstd(path, SPARSE)
-
-
-MAKERS: dict[str, tuple[str, Callable[[Path], object]]] = {
-    "pcap": ("a.pcap", lambda p: write_pcap(p, SPARSE)),
-    "pcap dual": ("a.pcap", lambda p: write_pcap(p, SPARSE[:1], returns="dual")),
-    "pcapng": ("a.pcapng", lambda p: write_ng(p, SPARSE[:1])),
-    "mcap": ("a.mcap", lambda p: write_mcap(p, SPARSE, poses=POSES)),
-    "mcap zstd": ("a.mcap", _zstd),
-    "bag": ("a.bag", lambda p: write_bag1(p, SPARSE)),
-    "bag bz2": ("a.bag", lambda p: write_bag1(p, SPARSE, compression="BZ2")),
-    "bag lz4 packets": (
-        "a.bag",
-        lambda p: write_bag1(p, SPARSE, compression="LZ4", packets=True),
-    ),
-    "db3": ("a.db3", lambda p: write_sqlite(p, SPARSE)),
-    "kitti": ("k", lambda p: write_kitti(p, SPARSE)),
-}
-
-
-def damage(data: bytes, rng: np.random.Generator) -> bytes:
-    """Return a copy that was cut, or in which bytes were changed, or replaced by noise."""
-    how = rng.integers(0, 5)
-    changed = bytearray(data)
-    if how == 0:
-        return bytes(changed[: rng.integers(0, len(changed))])
-    if how == 1:
-        for _ in range(rng.integers(1, 20)):
-            changed[rng.integers(0, len(changed))] ^= 1 << rng.integers(0, 8)
-        return bytes(changed)
-    if how == 2:
-        # lengths live near the start and the end
-        at = int(rng.integers(0, min(400, len(changed))))
-        at = at if rng.uniform() < 0.5 else len(changed) - 1 - at
-        changed[at : at + 4] = rng.integers(0, 256, 4, dtype=np.uint8).tobytes()
-        return bytes(changed)
-    if how == 3:
-        a, b = sorted(rng.integers(0, len(changed), 2).tolist())
-        return bytes(changed[:a] + changed[b:])
-    at = int(rng.integers(0, len(changed)))
-    n = int(rng.integers(1, 200))
-    changed[at : at + n] = rng.integers(0, 256, n, dtype=np.uint8).tobytes()
-    return bytes(changed)
-
-
-def read_all(path: Path, keep_partial: bool) -> None:
-    """Read scans and poses; let nothing but known errors out, in bounded time."""
+def run_all(jobs: Sequence[Callable[[], object]]) -> None:
+    """Run jobs on a damaged file; let nothing but known errors out, in bounded time."""
     start = time.monotonic()
-    for job in (
-        lambda: [len(scan.xyz) for scan in iter_scans(path, keep_partial=keep_partial)],
-        lambda: read_poses(path),
-    ):
+    for job in jobs:
         try:
             job()
         except CommonmapError as error:
@@ -97,25 +42,39 @@ def read_all(path: Path, keep_partial: bool) -> None:
     assert time.monotonic() - start < SLOW
 
 
-@pytest.mark.parametrize("kind", MAKERS)
+@pytest.fixture(autouse=True)
+def bounded() -> Iterator[None]:
+    old = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (DATA, old[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, old)
+
+
+@pytest.mark.parametrize("kind", LOGS)
 def test_damaged_logs_raise_known_errors(kind: str, tmp_path: Path) -> None:
-    name, write = MAKERS[kind]
+    name, write = LOGS[kind]
     path = tmp_path / name
     write(path)
     assert sum(len(scan.xyz) for scan in iter_scans(path)) > 0
     rng = np.random.default_rng(sum(kind.encode()))
+    victim = Victim(path)
     for i in range(N):
-        if path.is_dir():
-            victim = sorted(f for f in path.rglob("*") if f.is_file())[i % 7]
-            copy = tmp_path / "copy"
-            shutil.rmtree(copy, ignore_errors=True)
-            shutil.copytree(path, copy)
-            target = copy / victim.relative_to(path)
-        else:
-            victim, target = path, tmp_path / f"copy{path.suffix}"
-            copy = target
-        target.write_bytes(damage(victim.read_bytes(), rng))
-        read_all(copy, keep_partial=bool(i % 2))
+        victim.damage(i, rng)
+        run_all(jobs_on_log(path, keep_partial=bool(i // 2 % 2)))
+
+
+@pytest.mark.parametrize("kind", POSE_FILES)
+def test_damaged_poses_raise_known_errors(kind: str, tmp_path: Path) -> None:
+    name, write = POSE_FILES[kind]
+    path = tmp_path / name
+    write(path)
+    for job in jobs_on_poses(path):
+        job()
+    rng = np.random.default_rng(sum(kind.encode()))
+    victim = Victim(path)
+    for i in range(N):
+        victim.damage(i, rng)
+        run_all(jobs_on_poses(path))
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))

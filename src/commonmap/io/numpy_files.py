@@ -14,7 +14,7 @@ import numpy as np
 from commonmap.errors import EmptyMapError, InputError
 from commonmap.io.atomic import writing
 from commonmap.io.columns import Column, check_writable, checked_extra, cloud_of, require_xyz
-from commonmap.io.source import PathLike, look, parsing
+from commonmap.io.source import PathLike, look, open_bounded, parsing
 from commonmap.types import Cloud
 
 MAX_RATIO = 1100
@@ -39,7 +39,7 @@ def read_npz(path: PathLike) -> Cloud:
     that name.
     """
     path, _, _ = look(path)
-    with parsing(path, "NPZ"), zipfile.ZipFile(path) as archive:
+    with parsing(path, "NPZ"), open_bounded(path) as file, zipfile.ZipFile(file) as archive:
         members = {
             i.filename.removesuffix(".npy"): i
             for i in archive.infolist()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import logging
 import os
 from collections.abc import Iterator
@@ -74,6 +75,26 @@ def look(path: PathLike) -> tuple[Path, int, bytes]:
     if not head:
         raise InputError(f"{path} is empty (0 bytes)")
     return path, size, head
+
+
+class _Bounded(io.BufferedReader):
+    """A file that makes room for no more bytes than it has left, whatever is asked of it."""
+
+    def __init__(self, raw: io.FileIO):
+        super().__init__(raw)
+        self._size = raw.seek(0, io.SEEK_END)
+        raw.seek(0)
+
+    def read(self, size: int | None = -1) -> bytes:
+        """Return up to `size` bytes."""
+        if size is None or size < 0:
+            return super().read()
+        return super().read(min(size, max(self._size - self.tell(), 0)))
+
+
+def open_bounded(path: PathLike) -> io.BufferedReader:
+    """Return a file opened for a parser that believes the lengths it reads in it."""
+    return _Bounded(io.FileIO(path))
 
 
 def recognise(head: bytes) -> str | None:

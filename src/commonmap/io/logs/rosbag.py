@@ -7,7 +7,6 @@ a bag without definitions, or with odd ones of other topics, opens as well.
 from __future__ import annotations
 
 import contextlib
-import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -19,7 +18,7 @@ from commonmap.io.logs.livox import read_custom
 from commonmap.io.logs.pointcloud2 import CloudReader, PointCloud2, PointField
 from commonmap.io.logs.record import Log, Options, Teller, Topic, choose_topic, require_topic, shown
 from commonmap.io.logs.salvage import salvage
-from commonmap.io.source import log, look, looks_like, parsing, reason
+from commonmap.io.source import log, look, looks_like, open_bounded, parsing, reason
 from commonmap.io.velodyne import TurnReader
 from commonmap.types import Progress, Scan, no_progress
 
@@ -59,20 +58,7 @@ class BoundedPath(PosixPath):
 
     def open(self, *args: Any, **kwargs: Any) -> Any:
         """Open for reading, in binary."""
-        return _Bounded(io.FileIO(self))
-
-
-class _Bounded(io.BufferedReader):
-    def __init__(self, raw: io.FileIO):
-        super().__init__(raw)
-        self._size = raw.seek(0, io.SEEK_END)
-        raw.seek(0)
-
-    def read(self, size: int | None = -1) -> bytes:
-        """Return up to `size` bytes."""
-        if size is None or size < 0:
-            return super().read()
-        return super().read(min(size, max(self._size - self.tell(), 0)))
+        return open_bounded(self)
 
 
 def bag_path(path: Path) -> Path:
