@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import struct
 from collections import deque
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -179,7 +180,8 @@ class TurnReader:
         time = self._clock(host, words[-3])
         heard = self._place(time, azimuths, data)
         done = self._emit() if self._turn and int(heard.turn) != int(self._turn_number()) else None
-        self._turn = [h for h in self._turn if int(h.turn_end) >= int(heard.turn)]
+        if self._last is not None and int(heard.turn) > int(self._last.turn):
+            self._turn = [h for h in self._turn if int(h.turn_end) >= int(heard.turn)]
         self._turn.append(heard)
         self._last = heard
         if self._turn[-1].time - self._turn[0].time > MAX_TURN:
@@ -269,9 +271,9 @@ class TurnReader:
         turn = start
         if self._last is not None:
             step = time - self._last.time
-            gap = float(np.median(self._gaps)) if self._gaps else step
+            gap = _middle(self._gaps) if self._gaps else step
             lost = step > 1.5 * gap if gap > 0 else False
-            rate = float(np.median(self._rates)) if lost and self._rates else None
+            rate = _middle(self._rates) if lost and self._rates else None
             if rate is None:
                 rate = self._rates[-1] if self._rates else 10.0
             expected = self._last.turn + step * rate
@@ -317,6 +319,11 @@ class TurnReader:
             xyz=xyz, time=time, ring=ring, intensity=np.ascontiguousarray(table[:, 3]),
             stamp=float(time.min()),
         )  # fmt: skip
+
+
+def _middle(values: Collection[float]) -> float:
+    """Return the median of a few numbers, the upper of two (a thirtieth of the time of NumPy's)."""
+    return sorted(values)[len(values) // 2]
 
 
 def _nearest_hour(stamp_us: int, host: float) -> float:

@@ -7,6 +7,7 @@ half the distance: always keeping the nearest would favour returns that noise ma
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numba
 import numpy as np
@@ -19,6 +20,10 @@ WIDEN = float(np.sqrt(2.0))
 """By so much voxels widen when there are too many: surfaces then hold half as many."""
 
 KEY_HALF = 1 << 20
+
+SLOT = np.dtype([("key", np.int64), ("kept", np.int32), ("squared", np.float32)])
+"""A slot of the hash table: voxel, which of the kept points is its own (-1: none), and the square
+of the distance that one was seen from. All that a point needs to know lies in one cache line."""
 
 
 @dataclass
@@ -57,8 +62,8 @@ class Accumulator:
             np.empty((room, 3)), np.empty((room, 3), np.float32), np.empty(room),
             np.empty(room, np.float32),
         )  # fmt: skip
-        self._key: NDArray[np.int64] = np.empty(room, np.int64)
-        self._table: NDArray[np.int32] = np.full(1 << int(2 * room - 1).bit_length(), -1, np.int32)
+        self._table: NDArray[Any] = np.zeros(1 << int(2 * room - 1).bit_length(), SLOT)
+        self._table["kept"] = -1
 
     def add(self, cloud: Cloud) -> None:
         """Take in the points of a cloud that has time, ray origins and intensity."""
@@ -72,11 +77,11 @@ class Accumulator:
             done, self.n = _insert(
                 new.xyz, new.origin, new.time, new.intensity, done, 1.0 / self.voxel,
                 self._kept.xyz, self._kept.origin, self._kept.time, self._kept.intensity,
-                self._key, self._table, self.n,
+                self._table, self.n,
             )  # fmt: skip
             if done == len(new.xyz):
                 return
-            room = len(self._key)
+            room = len(self._kept.time)
             if room < self.max_points:
                 self._again(min(2 * room, self.max_points))
             else:
@@ -104,7 +109,7 @@ class Accumulator:
 def _insert(
     xyz: Float64s, origin: Float32s, time: Float64s, intensity: Float32s, first: int,
     scale: float, kept_xyz: Float64s, kept_origin: Float32s, kept_time: Float64s,
-    kept_intensity: Float32s, keys: NDArray[np.int64], table: NDArray[np.int32], n: int,
+    kept_intensity: Float32s, table: NDArray[Any], n: int,
 ) -> tuple[int, int]:  # fmt: skip
     """Put in points from `first` on; return (which point comes next, how many are kept).
 
@@ -113,28 +118,27 @@ def _insert(
     mask = len(table) - 1
     for p in range(first, len(xyz)):
         key = 0
+        squared = 0.0
         for axis in range(3):
             cell = int(np.floor(xyz[p, axis] * scale)) + KEY_HALF
             key = (key << 21) | (cell & 0x1FFFFF)
+            squared += (xyz[p, axis] - origin[p, axis]) ** 2
         # Fibonacci hashing: neighbouring voxels land far apart
-        slot = ((key * 0x9E3779B97F4A7C15) >> 20) & mask
-        while table[slot] >= 0 and keys[table[slot]] != key:
-            slot = (slot + 1) & mask
-        k = table[slot]
+        at = ((key * 0x9E3779B97F4A7C15) >> 20) & mask
+        while table[at].kept >= 0 and table[at].key != key:
+            at = (at + 1) & mask
+        k = table[at].kept
         if k >= 0:
-            new = old = 0.0
-            for axis in range(3):
-                new += (xyz[p, axis] - origin[p, axis]) ** 2
-                old += (kept_xyz[k, axis] - kept_origin[k, axis]) ** 2
-            if new >= 0.25 * old:
+            if squared >= 0.25 * table[at].squared:
                 continue
         else:
-            if n == len(keys):
+            if n == len(kept_time):
                 return p, n
             k = n
             n += 1
-            table[slot] = k
-            keys[k] = key
+            table[at].key = key
+            table[at].kept = k
+        table[at].squared = squared
         for axis in range(3):
             kept_xyz[k, axis] = xyz[p, axis]
             kept_origin[k, axis] = origin[p, axis]

@@ -31,7 +31,9 @@ def georeference(
     limit = _limit(time)
     for number, scan in enumerate(scans):
         xyz = np.asarray(scan.xyz, np.float64)
-        fit = np.isfinite(xyz).all(axis=1) & (np.square(xyz).sum(axis=1) > min_range**2)
+        x, y, z = xyz.T
+        squared = x * x + y * y + z * z
+        fit = np.isfinite(squared) & (squared > min_range**2)
         xyz, t = xyz[fit], np.asarray(scan.time, np.float64)[fit]
         if len(t) and (t.min() < time[0] - limit or t.max() > time[-1] + limit):
             raise InputError(

@@ -15,6 +15,7 @@ import numpy as np
 from commonmap.errors import InputError
 from commonmap.io import scans as own
 from commonmap.io.logs.derive import Seam, find_seam, rings_of, times_of
+from commonmap.io.logs.pointcloud2 import are_returns
 from commonmap.io.logs.record import Log, Options, Teller
 from commonmap.io.source import log, parsing
 from commonmap.types import Float64s, Progress, Scan, no_progress
@@ -204,7 +205,7 @@ def _read(file: Path, stamp: float, period: float, options: Options, teller: Tel
         xyz = cloud.xyz.astype(np.float32)
         intensity = np.zeros(len(xyz), np.float32) if cloud.intensity is None else cloud.intensity
         time = cloud.time
-    kept = np.isfinite(xyz).all(axis=1) & (np.abs(xyz).max(axis=1, initial=0.0) > 1e-6)
+    kept = are_returns(xyz)
     if not kept.any():
         return None
     xyz = xyz[kept]

@@ -132,8 +132,7 @@ class CloudReader:
             )
         planes = [columns[name].astype(np.float32).ravel() for name in "xyz"]
         xyz = np.stack(planes, axis=1) if len(planes[0]) else np.empty((0, 3), np.float32)
-        with np.errstate(over="ignore", invalid="ignore"):
-            kept = np.isfinite(xyz).all(axis=1) & (np.abs(xyz).max(axis=1, initial=0.0) > 1e-6)
+        kept = are_returns(xyz)
         xyz = xyz[kept]
         if not len(xyz):
             return None
@@ -216,6 +215,13 @@ class CloudReader:
             rest = values - whole * per_second
         result: Float64s = whole + rest * self._unit
         return result
+
+
+def are_returns(xyz: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Return which points (N, 3) are finite and not at the sensor."""
+    x, y, z = xyz.T  # column by column: a reduction over three numbers a row is slow
+    there = (np.abs(x) > 1e-6) | (np.abs(y) > 1e-6) | (np.abs(z) > 1e-6)
+    return np.asarray(there & np.isfinite(x) & np.isfinite(y) & np.isfinite(z))
 
 
 def _round_up(top: int) -> int:
