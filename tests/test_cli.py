@@ -438,6 +438,20 @@ def test_a_signal_ends_a_real_run_cleanly(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_an_interrupt_within_compiled_code_is_an_interrupt(
+    folder: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*args: Any, **options: Any) -> Match:
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as error:
+            raise SystemError("returned a result with an exception set") from error
+
+    monkeypatch.setattr(pipeline, "match", interrupted)
+    done = run("match", folder / "base.ply", folder / "draft.ply", "-q")
+    assert done.code == 130 and done.err == "commonmap: interrupted; nothing was written\n"
+
+
 def test_a_fault_of_ours_keeps_its_traceback(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pipeline, "match", lambda *a, **k: 1 / 0)
     words = ["commonmap", "match", str(folder / "base.ply"), str(folder / "draft.ply"), "-q"]

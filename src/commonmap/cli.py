@@ -100,6 +100,11 @@ def main() -> NoReturn:
         _fail(error.format_message().rstrip(".") + hint, 2)
     except (KeyboardInterrupt, typer.Abort):
         _fail("interrupted; nothing was written", INTERRUPTED)
+    except SystemError as error:
+        # An interrupt that comes while compiled code takes its arguments arrives wrapped
+        if not _comes_of_interrupt(error):
+            raise
+        _fail("interrupted; nothing was written", INTERRUPTED)
     except BrokenPipeError:
         # Whoever read our output has gone: that is no error of ours
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -541,7 +546,7 @@ def _take_both(
     topics: list[str] | None, keep_partial: bool, progress: Any,
 ) -> tuple[Input, Input]:  # fmt: skip
     """Return both inputs as maps; raw logs go through odometry first."""
-    from commonmap import cli_logs
+    from commonmap import cli_beside, cli_logs
 
     for path in (base, draft):
         if not path.exists():
@@ -552,8 +557,7 @@ def _take_both(
     )  # fmt: skip
     for one in options:
         one.chosen()
-    first = cli_logs.take(base, options[0], progress)
-    return first, cli_logs.take(draft, options[1], progress)
+    return cli_beside.take_both([base, draft], options, progress)
 
 
 def _say_errors(name: str, errors: TrajectoryErrors) -> None:
@@ -641,6 +645,14 @@ def _notes(quiet: bool) -> Iterator[None]:
         yield
     finally:
         logger.removeHandler(handler)
+
+
+def _comes_of_interrupt(error: BaseException) -> bool:
+    """Return whether an interrupt is among the causes of an error."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, KeyboardInterrupt):
+        cause = cause.__cause__ or cause.__context__
+    return cause is not None
 
 
 def _fail(message: str, code: int) -> NoReturn:

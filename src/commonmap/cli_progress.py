@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -27,11 +28,11 @@ class _Lines:
 
     def __init__(self) -> None:
         self.start = time.perf_counter()
-        self.step = ""
+        self.told: set[str] = set()
 
     def __call__(self, step: str, share: float = 0.0) -> None:
-        if step != self.step:
-            self.step = step
+        if step not in self.told:
+            self.told.add(step)
             seconds = time.perf_counter() - self.start
             print(f"{seconds:7.1f} s  {step}", file=sys.stderr, flush=True)
 
@@ -49,9 +50,13 @@ def _moving() -> Iterator[Progress]:
         TimeElapsedColumn(),
     )
     with Bars(*columns, console=Console(stderr=True), transient=True) as bars:
-        task = bars.add_task("start", total=1.0)
+        tasks = {threading.get_ident(): bars.add_task("start", total=1.0)}
 
         def tell(step: str, share: float = 0.0) -> None:
-            bars.update(task, description=step, completed=share)
+            # jobs that run at once tell from threads of their own: a bar each
+            me = threading.get_ident()
+            if me not in tasks:
+                tasks[me] = bars.add_task(step, total=1.0)
+            bars.update(tasks[me], description=step, completed=share)
 
         yield tell
