@@ -76,10 +76,10 @@ def test_one_core_and_small_logs_need_no_process(
     monkeypatch.setattr(cli_beside, "_Beside", None)
     monkeypatch.setattr(cli_beside, "take", lambda path, options, progress: path)
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0})
-    assert take_both(logs, OPTIONS, ignore) == tuple(logs)
+    assert [str(path) for path in take_both(logs, OPTIONS, ignore)] == [str(p) for p in logs]
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1})
     monkeypatch.setattr(cli_beside, "SMALL", 10_000_000_000)
-    assert take_both(logs, OPTIONS, ignore) == tuple(logs)
+    assert [str(path) for path in take_both(logs, OPTIONS, ignore)] == [str(p) for p in logs]
 
 
 def test_an_error_of_the_other_log_is_the_users(logs: list[Path], tmp_path: Path) -> None:
