@@ -3,6 +3,7 @@
 
     python benchmarks/octree.py                      # everything, three quarters of an hour
     python benchmarks/octree.py --scans 20 --peer-seconds 10
+    python benchmarks/octree.py --resolution 0.2     # one row anew, the others of the record stay
     python benchmarks/octree.py --stream             # a log mapped as it comes, odometry included
 
 Each tree takes the same scans in a process of its own: pyoctomap, ours on one thread, ours on two.
@@ -10,7 +11,7 @@ Ratios are of the CPU time of one thread. Two threads are told by wall time, whi
 machine lengthen, and by the CPU time of the thread that does most, which they do not. Files are
 compared by their SHA-256. Where `--peer-seconds` stops the peer early, ratio and files are of the
 scans that it did. Peaks are by how much the peak of resident memory grows over all scans, and over
-writing the file. Raw times go to `benchmarks/records/octree.json`.
+writing the file. Raw times go to `benchmarks/records/octree.json`; a row is of one run.
 
 `--stream`: turns of a VLP-16 on a simulated drive go one by one through LOAM, and each, deskewed,
 into the octree as soon as its pose is final; all on one thread.
@@ -129,7 +130,7 @@ class Ours:
     def write(self, path: Path) -> None:
         from commonmap.io.octomap import write_octree
 
-        write_octree(path, self.tree.leaves())
+        write_octree(path, self.tree.leaf_parts())
 
     def figures(self) -> dict[str, Any]:
         """Return what the tree says of itself."""
@@ -217,6 +218,7 @@ def compare(resolution: float, n: int, peer_seconds: float, bandwidth: float) ->
     speed = sum(steps) / sum(one["cpu_seconds"])
     return {
         "resolution": resolution,
+        "copy_bytes_per_second": bandwidth,
         "scans": n,
         "scans_of_both": both,
         "ratio": sum(peer["cpu_seconds"]) / sum(one["cpu_seconds"][:both]),
@@ -357,7 +359,6 @@ def main() -> None:
         "peer": "pyoctomap " + __import__("pyoctomap").__version__,
         "max_range": MAX_RANGE,
         "points_per_scan": N_POINTS // 16 * 16,
-        "copy_bytes_per_second": bandwidth,
         "rows": rows,
     }
     path = args.record or RECORDS / ("octree_stream.json" if args.stream else "octree.json")
@@ -372,9 +373,13 @@ def main() -> None:
             "voxel m | scans | peer ms | ours ms | ratio | two threads: wall, CPU | identical"
             " | Msteps/s (of bandwidth) | peak MB: peer, ours on one, on two"
         )
+        if path.exists():
+            rows += json.loads(path.read_text())["rows"]
         for resolution in args.resolution:
-            rows.append(compare(resolution, args.scans, args.peer_seconds, bandwidth))
-            say(rows[-1])
+            row = compare(resolution, args.scans, args.peer_seconds, bandwidth)
+            say(row)
+            rows[:] = [old for old in rows if old["resolution"] != resolution] + [row]
+            rows.sort(key=lambda row: -row["resolution"])
             path.write_text(json.dumps(record, indent=1) + "\n")
 
 

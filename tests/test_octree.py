@@ -289,8 +289,22 @@ def test_impossible_arrays_are_refused() -> None:
         tree.insert((0, 0, 0), np.zeros((4, 2)))
     with pytest.raises(InputError, match="origin"):
         tree.insert(np.zeros((2, 3)), np.zeros((3, 3)))
-    with pytest.raises(InputError, match="discretize"):
-        tree.insert(np.zeros((3, 3)), np.zeros((3, 3)), discretize=True)
+
+
+def test_discretised_rays_begin_at_the_origin_of_the_first_point_of_their_voxel() -> None:
+    rng = np.random.default_rng(5)
+    start = np.array([0.0, 0.0, 1.5])
+    points = room_scan(start, rng)
+    one, each = Octree(0.2), Octree(0.2)
+    one.insert(start, points, discretize=True)
+    each.insert(np.broadcast_to(start, points.shape), points, discretize=True)
+    assert np.array_equal(one.leaves().log_odds, each.leaves().log_odds)
+    mixed, by_hand = Octree(1.0), Octree(1.0)
+    ends = [[5.2, 0.5, 0.5], [5.7, 0.5, 0.5], [0.5, 5.5, 0.5]]
+    mixed.insert([[0.5, 0.5, 0.5], [5.5, 9.5, 0.5], [3.5, 5.5, 0.5]], ends, discretize=True)
+    by_hand.insert([[0.5, 0.5, 0.5], [3.5, 5.5, 0.5]], [[5.5, 0.5, 0.5], [0.5, 5.5, 0.5]])
+    assert np.array_equal(mixed.leaves().keys, by_hand.leaves().keys)
+    assert np.array_equal(mixed.leaves().log_odds, by_hand.leaves().log_odds)
 
 
 def test_leaves_go_in_and_come_out() -> None:

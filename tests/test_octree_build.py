@@ -220,6 +220,16 @@ def test_a_log_with_poses_becomes_the_octree_of_its_turns(
     assert out.read_bytes() == (tmp_path / "expected.ot").read_bytes()
     told = capsys.readouterr()
     assert told.out == told.err == ""
+    # one ray a voxel
+    assert call(monkeypatch, *common, *options, "-o", out, "--discretize", "-q") == 0
+    few = Octree(
+        0.2, hit=probability(0.85), miss=probability(-0.4), clamp_min=probability(-2.0),
+        clamp_max=probability(3.5),
+    )  # fmt: skip
+    insert_log(scans, few, known(poses), max_range=10.0, discretize=True)
+    write_octree(tmp_path / "expected.ot", few.leaves())
+    assert out.read_bytes() == (tmp_path / "expected.ot").read_bytes()
+    assert few.count_nodes() != tree.count_nodes()
 
 
 def test_a_log_without_poses_is_mapped_by_odometry(
@@ -286,6 +296,7 @@ def test_a_cloud_in_large_coordinates_gets_a_moved_frame(
         (["cloud.ply", "-o", "map.ot", "--topic", "a"], "--topic"),
         (["cloud.ply", "-o", "map.ot", "--poses", "poses.tum"], "have none"),
         (["cloud.ply", "-o", "map.ot", "--max-range", "9"], "max_range needs"),
+        (["cloud.ply", "-o", "map.ot", "--discretize"], "discretize needs"),
         (["map.bt", "-o", "map.ot"], "octree already"),
         (["log", "-o", "nowhere/map.ot"], "nowhere"),
     ],

@@ -319,6 +319,10 @@ def octree_command(
     max_range: Annotated[
         float | None, typer.Option(help="Longer rays free up to here and hit nothing, metres.")
     ] = None,
+    discretize: Annotated[
+        bool,
+        typer.Option("--discretize", help="One ray a voxel of each turn, to its centre: faster."),
+    ] = False,
     poses: Annotated[
         Path | None, typer.Option("--poses", help="Known poses (TUM, KITTI, bag); else by LOAM.")
     ] = None,
@@ -349,21 +353,19 @@ def octree_command(
     """Map a raw log or a cloud into an octree: occupied, free, unknown (Hornung et al. 2013)."""
     from commonmap import cli_octree, cli_results
     from commonmap.cli_progress import telling
-    from commonmap.io.octomap import write_octree
 
     cli_results.check_file(out)
     cli_octree.check_name(out)
     tree = cli_octree.make_tree(
         resolution, l_occ=l_occ, l_free=l_free, l_min=l_min, l_max=l_max, threads=threads
     )
-    options = cli_octree.Options(max_range, poses, origin, topic, keep_partial)
+    options = cli_octree.Options(max_range, discretize, poses, origin, topic, keep_partial)
     with _notes(quiet), telling(quiet=quiet) as progress:
         told = cli_octree.fill(tree, source, options, progress)
         progress("write the octree")
-        leaves = tree.leaves(pruned=not lazy)
-        write_octree(out, leaves)
+        told += cli_octree.write(tree, out, pruned=not lazy)
     if not quiet:
-        for line in (*told, *cli_octree.describe(tree, leaves)):
+        for line in told:
             print(line)
         print(f"written: {out}")
     return 0

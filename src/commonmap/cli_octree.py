@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,10 +13,11 @@ from commonmap import cli_logs
 from commonmap.errors import EmptyMapError, InputError
 from commonmap.io.formats import read_map
 from commonmap.io.logs import iter_scans, open_log, read_poses
+from commonmap.io.octomap import write_octree
 from commonmap.mapping.octree import Octree, probability
 from commonmap.mapping.octree_build import insert_cloud, insert_log
 from commonmap.merging.products import choose_octree_origin
-from commonmap.types import Cloud, Float64s, Leaves, Progress
+from commonmap.types import Cloud, Float64s, LeafParts, Leaves, Progress
 
 LIDAR_REACH = 300.0
 """Metres around the sensor that a turn's points may lie in."""
@@ -23,10 +25,14 @@ LIDAR_REACH = 300.0
 
 @dataclass(frozen=True)
 class Options:
-    """What is known of the rays. max_range: metres. poses: file of the sensor's poses. origin: of
-    a cloud, where the sensor stood. topic, keep_partial: of a log, see `cli_logs.LogOptions`."""
+    """What is known of the rays, and wanted of them.
+
+    max_range: metres. discretize: one ray a voxel. poses: file of the sensor's poses. origin: of a
+    cloud, where the sensor stood. topic, keep_partial: of a log, see `cli_logs.LogOptions`.
+    """
 
     max_range: float | None = None
+    discretize: bool = False
     poses: Path | None = None
     origin: tuple[float, float, float] | None = None
     topic: str | None = None
@@ -95,13 +101,22 @@ def fill(tree: Octree, source: Path, options: Options, progress: Progress) -> li
     return _fill_from_cloud(tree, cloud, options, progress)
 
 
-def describe(tree: Octree, leaves: Leaves) -> list[str]:
-    """Return a line on what the octree holds."""
-    volume = leaves.sizes() ** 3
-    occupied = leaves.occupied
+def write(tree: Octree, out: Path, *, pruned: bool) -> list[str]:
+    """Write the octree part by part; return a line on what it holds."""
+    parts = tree.leaf_parts(pruned=pruned)
+    tally = np.zeros(3)
+
+    def counted() -> Iterator[Leaves]:
+        tally[:] = 0.0
+        for part in parts:
+            volume, occupied = part.sizes() ** 3, part.occupied
+            tally[:] += len(volume), volume[occupied].sum(), volume[~occupied].sum()
+            yield part
+
+    write_octree(out, LeafParts(tree.resolution, counted))
     return [
-        f"{len(leaves.depth)} leaves, {tree.memory_bytes() / 1e6:.0f} MB in memory; "
-        f"{volume[occupied].sum():.1f} m3 occupied, {volume[~occupied].sum():.1f} m3 free"
+        f"{tally[0]:.0f} leaves, {tree.memory_bytes() / 1e6:.0f} MB in memory; "
+        f"{tally[1]:.1f} m3 occupied, {tally[2]:.1f} m3 free"
     ]
 
 
@@ -112,7 +127,7 @@ def _fill_from_log(tree: Octree, path: Path, options: Options, progress: Progres
     shift = _choose_shift(np.vstack([places - LIDAR_REACH, places + LIDAR_REACH]), tree)
     left_out = insert_log(
         iter_scans(path, topic=options.topic, keep_partial=options.keep_partial), tree,
-        robot.odometry, max_range=options.reach, shift=shift,
+        robot.odometry, max_range=options.reach, discretize=options.discretize, shift=shift,
         n_scans=open_log(path, topic=options.topic, keep_partial=options.keep_partial).n_scans,
         progress=progress,
     )  # fmt: skip
@@ -127,8 +142,8 @@ def _fill_from_cloud(tree: Octree, cloud: Cloud, options: Options, progress: Pro
     shift = _choose_shift(cloud.xyz[finite], tree)
     poses = None if options.poses is None else read_poses(options.poses)
     rays = insert_cloud(
-        cloud, tree, origin=options.origin, poses=poses, max_range=options.reach, shift=shift,
-        progress=progress,
+        cloud, tree, origin=options.origin, poses=poses, max_range=options.reach,
+        discretize=options.discretize, shift=shift, progress=progress,
     )  # fmt: skip
     told = f"{int(finite.sum())} points"
     if not rays:

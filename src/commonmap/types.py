@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -72,6 +72,23 @@ class Leaves:
         """Return the centre of each leaf in metres, (N, 3), in the frame of the tree."""
         corner = (self.keys.astype(np.float64) - KEY_ORIGIN) * self.resolution
         return corner + 0.5 * self.sizes()[:, None]
+
+
+@dataclass(frozen=True, eq=False)
+class LeafParts:
+    """The leaves of an octree in parts, one after the other in Morton order.
+
+    For trees whose leaves would fill the memory if they were made all at once.
+
+    resolution: edge of the smallest voxel, metres.
+    make: returns the parts, anew at each call.
+    """
+
+    resolution: float
+    make: Callable[[], Iterator[Leaves]]
+
+    def __iter__(self) -> Iterator[Leaves]:
+        return self.make()
 
 
 @dataclass(frozen=True, eq=False)

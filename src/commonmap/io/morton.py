@@ -8,14 +8,19 @@ depth `d` covers the codes `code` to `code + 8**(16 - d)`, the end not included.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from commonmap.errors import InputError
-from commonmap.types import TREE_DEPTH, Leaves
+from commonmap.types import TREE_DEPTH, Float32s, Leaves
 
 Codes = NDArray[np.int64]
+
+Part = tuple[Codes, NDArray[np.uint8], Float32s]
+"""Some leaves in Morton order: codes, depth, log-odds, (N,) each."""
 
 
 @numba.njit(cache=True, inline="always")  # type: ignore[misc]
@@ -71,30 +76,32 @@ def decode(codes: Codes) -> NDArray[np.uint16]:
 
 
 @numba.njit(cache=True)  # type: ignore[misc]
-def _check(codes, depth):  # type: ignore[no-untyped-def]
+def _check(keys, depth):  # type: ignore[no-untyped-def]
     """0: sorted and apart; 1: not sorted; 2: a leaf off its own grid; 3: deeper than the tree."""
-    for n in range(codes.shape[0]):
+    end = np.int64(0)
+    state = 0
+    for n in range(keys.shape[0]):
         if depth[n] > TREE_DEPTH:
             return 3
-        if codes[n] & ((np.int64(1) << (3 * (TREE_DEPTH - depth[n]))) - 1):
+        code = spread(keys[n, 0]) | spread(keys[n, 1]) << 1 | spread(keys[n, 2]) << 2
+        size = np.int64(1) << (3 * (TREE_DEPTH - depth[n]))
+        if code & (size - 1):
             return 2
-    for n in range(1, codes.shape[0]):
-        if codes[n] < codes[n - 1] + (np.int64(1) << (3 * (TREE_DEPTH - depth[n - 1]))):
-            return 1
-    return 0
+        if code < end:
+            state = 1
+        end = code + size
+    return state
 
 
-def sort(leaves: Leaves) -> tuple[Leaves, Codes]:
-    """Return the leaves in Morton order and their codes, or raise where leaves overlap."""
-    codes = encode(leaves.keys)
-    state = _check(codes, leaves.depth)
+def in_order(leaves: Leaves) -> Leaves:
+    """Return the leaves in Morton order, or raise where they overlap."""
+    state = _check(leaves.keys, leaves.depth)
     if state == 1:
-        order = np.argsort(codes, kind="stable")
-        codes = codes[order]
+        order = np.argsort(encode(leaves.keys), kind="stable")
         leaves = Leaves(
             leaves.resolution, leaves.keys[order], leaves.depth[order], leaves.log_odds[order]
         )
-        state = _check(codes, leaves.depth)
+        state = _check(leaves.keys, leaves.depth)
         if state == 1:
             raise InputError("leaves of an octree must not overlap; two of them share a voxel")
     if state == 2:
@@ -103,7 +110,13 @@ def sort(leaves: Leaves) -> tuple[Leaves, Codes]:
         )
     if state == 3:
         raise InputError(f"an octree is {TREE_DEPTH} levels deep; a leaf says it lies deeper")
-    return leaves, codes
+    return leaves
+
+
+def sort(leaves: Leaves) -> tuple[Leaves, Codes]:
+    """Return the leaves in Morton order and their codes, or raise where leaves overlap."""
+    ordered = in_order(leaves)
+    return ordered, encode(ordered.keys)
 
 
 @numba.njit(cache=True)  # type: ignore[misc]
@@ -141,6 +154,24 @@ def prune(leaves: Leaves) -> Leaves:
     return Leaves(leaves.resolution, decode(codes[:n]), depth[:n].copy(), value[:n].copy())
 
 
+def join_parts(parts: Iterable[Part]) -> Iterator[Part]:
+    """Join equal siblings as `join_siblings` does, of leaves that come part by part.
+
+    The last leaves of a part are held back: at most 7 of each level can still be joined with later
+    ones.
+    """
+    held: Part = np.empty(0, np.int64), np.empty(0, np.uint8), np.empty(0, np.float32)
+    for part in parts:
+        codes = np.concatenate([held[0], part[0]])
+        depth = np.concatenate([held[1], part[1]])
+        value = np.concatenate([held[2], part[2]])
+        n = int(join_siblings(codes, depth, value, np.zeros(len(codes), np.int64)))
+        cut = max(n - 7 * TREE_DEPTH, 0)
+        held = codes[cut:n].copy(), depth[cut:n].copy(), value[cut:n].copy()
+        yield codes[:cut], depth[:cut], value[:cut]
+    yield held
+
+
 @numba.njit(cache=True, inline="always")  # type: ignore[misc]
 def shared_depth(a, b):  # type: ignore[no-untyped-def]
     """Return the depth of the deepest node that holds both voxels; `a` and `b` differ."""
@@ -153,16 +184,20 @@ def shared_depth(a, b):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)  # type: ignore[misc]
-def count_inner(codes, depth):  # type: ignore[no-untyped-def]
-    """Return how many inner nodes stand above sorted leaves, the root among them."""
+def count_inner(codes, depth, before):  # type: ignore[no-untyped-def]
+    """Return how many inner nodes sorted leaves need that the leaf of code `before` has not.
+
+    before: -1 for none; then the root is among them.
+    """
     inner = 0
     for n in range(codes.shape[0]):
-        above = -1 if n == 0 else shared_depth(codes[n - 1], codes[n])
+        above = -1 if before < 0 else shared_depth(before, codes[n])
         inner += depth[n] - 1 - above
+        before = codes[n]
     return inner
 
 
 def count_nodes(leaves: Leaves) -> int:
     """Return the number of nodes, inner and leaf, of the octree: OctoMap's `size()`."""
     ordered, codes = sort(leaves)
-    return int(count_inner(codes, ordered.depth)) + len(codes)
+    return int(count_inner(codes, ordered.depth, -1)) + len(codes)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from commonmap.errors import InputError
 from commonmap.frames import from_quaternion
-from commonmap.types import TREE_DEPTH, Float32s, Float64s, Leaves
+from commonmap.types import TREE_DEPTH, Float32s, Float64s, LeafParts, Leaves
 
 _LOG = logging.getLogger("commonmap")
 
@@ -135,12 +135,14 @@ def read_octree(path: str | Path) -> Leaves:
     return _read_binary(path, header, data) if header.binary else _read_full(path, header, data)
 
 
-def write_octree(path: str | Path, leaves: Leaves) -> None:
+def write_octree(path: str | Path, leaves: Leaves | LeafParts) -> None:
     """Write leaves as `.ot` (log-odds, the leaves as they are) or `.bt` (occupied or free, pruned).
 
     What `read_octree` read from an `.ot` file that OctoMap wrote comes out byte for byte. The file
-    appears when it is complete.
+    appears when it is complete. Memory beside the leaves is a few tens of megabytes, and for
+    `LeafParts` that is all.
     """
+    from commonmap.io import octomap_stream
     from commonmap.io.atomic import writing
 
     path = Path(path)
@@ -148,12 +150,11 @@ def write_octree(path: str | Path, leaves: Leaves) -> None:
         raise InputError(f"an octree is written as .ot or .bt; the file is called {path.name}")
     if not (np.isfinite(leaves.resolution) and leaves.resolution > 0):
         raise InputError(f"resolution must be metres above 0; {leaves.resolution} came")
-    if not np.isfinite(leaves.log_odds).all():
-        raise InputError("the log-odds of an octree must be finite; NaN or infinity came")
-    content = _binary_bytes(leaves) if path.suffix.lower() == ".bt" else _full_bytes(leaves)
+    binary = path.suffix.lower() == ".bt"
+    n_nodes = octomap_stream.count_nodes(leaves, binary=binary)
     with writing(path) as unfinished, open(unfinished, "wb") as file:
-        for part in content:
-            file.write(part)
+        file.write(_header_bytes(BT_MAGIC if binary else OT_MAGIC, n_nodes, leaves.resolution))
+        octomap_stream.write_nodes(file, leaves, binary=binary)
 
 
 def read_scan_graph(path: str | Path) -> list[GraphScan]:
@@ -261,34 +262,6 @@ def _header_bytes(magic: bytes, n_nodes: int, resolution: float) -> bytes:
     short = f"{resolution:g}"  # OctoMap writes six digits; more only where six would lose some
     res = short if float(short) == resolution else repr(float(resolution))
     return magic + b"\n" + _ADVICE + f"id OcTree\nsize {n_nodes}\nres {res}\ndata\n".encode()
-
-
-def _full_bytes(leaves: Leaves) -> tuple[bytes, bytes]:
-    from commonmap.io import morton, octomap_nodes
-
-    leaves, codes = morton.sort(leaves)
-    n_nodes = int(morton.count_inner(codes, leaves.depth)) + len(codes)
-    value, children = np.empty(n_nodes, np.float32), np.empty(n_nodes, np.uint8)
-    octomap_nodes.write_full(codes, leaves.depth, leaves.log_odds, value, children)
-    nodes = np.empty(n_nodes, np.dtype([("value", "<f4"), ("children", "u1")]))
-    nodes["value"], nodes["children"] = value, children
-    return _header_bytes(OT_MAGIC, n_nodes, leaves.resolution), nodes.tobytes()
-
-
-def _binary_bytes(leaves: Leaves) -> tuple[bytes, bytes]:
-    from commonmap.io import morton, octomap_nodes
-
-    sign = np.where(leaves.occupied, LOG_ODDS_OCCUPIED, LOG_ODDS_FREE)
-    pruned = morton.prune(Leaves(leaves.resolution, leaves.keys, leaves.depth, sign))
-    if len(pruned.depth) == 1 and pruned.depth[0] == 0:  # a root alone has no bits of its own
-        keys = morton.decode(np.arange(8, dtype=np.int64) << (3 * (TREE_DEPTH - 1)))
-        pruned = Leaves(leaves.resolution, keys, np.ones(8, np.uint8), np.repeat(sign[:1], 8))
-    codes = morton.encode(pruned.keys)
-    n_inner = int(morton.count_inner(codes, pruned.depth))
-    bits = np.empty(n_inner, np.uint16)
-    octomap_nodes.write_binary(codes, pruned.depth, pruned.occupied, bits)
-    header = _header_bytes(BT_MAGIC, n_inner + len(codes), leaves.resolution)
-    return header, bits.astype("<u2").tobytes()
 
 
 def _read_bytes(path: Path, limit: int = -1) -> bytes:

@@ -106,42 +106,86 @@ def read_binary(data, fill, codes, depth, occupied):  # type: ignore[no-untyped-
 
 
 @numba.njit(cache=True)  # type: ignore[misc]
-def write_full(codes, depth, value, out_value, out_children):  # type: ignore[no-untyped-def]
-    """Fill value and children byte of every node, in pre-order, from leaves in Morton order.
+def fill_nodes(  # type: ignore[no-untyped-def]
+    codes,
+    depth,
+    value,
+    binary,
+    walk,
+    at,
+    best,
+    mask,
+    out_value,
+    out_mask,
+    mend,
+    mend_value,
+    mend_mask,
+):
+    """Make the nodes of the next leaves of a stream; return how many older ones are to mend.
 
-    An inner node has the largest value of its leaves, as OctoMap keeps it.
+    codes, depth, value: (N,) leaves in Morton order, all after those of earlier calls.
+    binary: nodes are the inner ones, and their mask has two bits a child; else all nodes, one bit a
+    child, and an inner node has the largest value of its leaves, as OctoMap keeps it.
+    walk: (3,) number of the next node, code of the last leaf (-1: none), how many inner nodes are
+    open, from the root on. at, best, mask: (16,) number, value and mask of these so far.
+    out_value, out_mask: are filled from the first new node on; an inner node when it is closed.
+    mend, mend_value, mend_mask: (16,) number, value and mask of nodes of earlier calls that this
+    one closed.
     """
-    path = np.zeros(TREE_DEPTH + 1, np.int64)
-    node = 0
+    first = walk[0]
+    mends = 0
     for n in range(codes.shape[0]):
-        above = -1 if n == 0 else shared_depth(codes[n - 1], codes[n])
+        above = -1 if walk[1] < 0 else shared_depth(walk[1], codes[n])
+        while walk[2] > above + 1:
+            mends = _close(walk, at, best, mask, first, out_value, out_mask,
+                           mends, mend, mend_value, mend_mask)  # fmt: skip
         for d in range(above + 1, depth[n] + 1):
-            path[d] = node
-            out_value[node] = value[n]
-            out_children[node] = 0
+            inner = d < depth[n]
             if d > 0:
                 child = (codes[n] >> (3 * (TREE_DEPTH - d))) & 7
-                out_children[path[d - 1]] |= 1 << child
-            node += 1
-        for d in range(above, -1, -1):
-            if not value[n] > out_value[path[d]]:
-                break
-            out_value[path[d]] = value[n]
+                if not binary:
+                    mask[d - 1] |= 1 << child
+                elif inner:
+                    mask[d - 1] |= 3 << (2 * child)
+                else:
+                    mask[d - 1] |= (2 if value[n] >= 0 else 1) << (2 * child)
+            if inner:
+                at[d], best[d], mask[d] = walk[0], value[n], 0
+                walk[2] = d + 1
+                walk[0] += 1
+        if depth[n] > 0 and value[n] > best[depth[n] - 1]:
+            best[depth[n] - 1] = value[n]
+        if not binary:
+            out_value[walk[0] - first] = value[n]
+            out_mask[walk[0] - first] = 0
+            walk[0] += 1
+        walk[1] = codes[n]
+    return mends
 
 
 @numba.njit(cache=True)  # type: ignore[misc]
-def write_binary(codes, depth, occupied, out):  # type: ignore[no-untyped-def]
-    """Fill the 16 bits of every inner node, in pre-order, from leaves in Morton order."""
-    path = np.zeros(TREE_DEPTH + 1, np.int64)
-    node = 0
-    for n in range(codes.shape[0]):
-        above = -1 if n == 0 else shared_depth(codes[n - 1], codes[n])
-        for d in range(above + 1, depth[n] + 1):
-            if d < depth[n]:
-                path[d] = node
-                out[node] = 0
-                node += 1
-            if d > 0:
-                child = (codes[n] >> (3 * (TREE_DEPTH - d))) & 7
-                kind = 3 if d < depth[n] else (2 if occupied[n] else 1)
-                out[path[d - 1]] |= kind << (2 * child)
+def close_nodes(walk, at, best, mask, mend, mend_value, mend_mask):  # type: ignore[no-untyped-def]
+    """Close the nodes that are open after the last leaf; return how many are to mend."""
+    none_value, none_mask = np.empty(0, np.float32), np.empty(0, np.uint16)
+    mends = 0
+    while walk[2] > 0:
+        mends = _close(walk, at, best, mask, walk[0], none_value, none_mask,
+                       mends, mend, mend_value, mend_mask)  # fmt: skip
+    return mends
+
+
+@numba.njit(cache=True, inline="always")  # type: ignore[misc]
+def _close(  # type: ignore[no-untyped-def]
+    walk, at, best, mask, first, out_value, out_mask, mends, mend, mend_value, mend_mask
+):
+    """Close the deepest open node: into the new nodes, or to the list of those to mend."""
+    d = walk[2] - 1
+    walk[2] = d
+    if d > 0 and best[d] > best[d - 1]:
+        best[d - 1] = best[d]
+    if at[d] >= first:
+        out_value[at[d] - first] = best[d]
+        out_mask[at[d] - first] = mask[d]
+        return mends
+    mend[mends], mend_value[mends], mend_mask[mends] = at[d], best[d], mask[d]
+    return mends + 1

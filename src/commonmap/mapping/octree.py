@@ -22,9 +22,9 @@ from commonmap.errors import InputError
 from commonmap.io import morton
 from commonmap.mapping import octree_kernels as kernels
 from commonmap.mapping import octree_rays, octree_threads
-from commonmap.mapping.octree_blocks import BLOCK, Blocks, leaves_of, leaves_to_blocks
+from commonmap.mapping.octree_blocks import BLOCK, Blocks, leaf_parts, leaves_of, leaves_to_blocks
 from commonmap.mapping.octree_scan import ScanBits
-from commonmap.types import KEY_ORIGIN, TREE_DEPTH, Bools, Float32s, Float64s, Leaves
+from commonmap.types import KEY_ORIGIN, TREE_DEPTH, Bools, Float32s, Float64s, LeafParts, Leaves
 
 MAX_THREADS = 64
 
@@ -111,15 +111,14 @@ class Octree:
         points: (N, 3) ray ends, metres; points that are not finite are left out. Both are of the
         map's frame, or of the sensor's where `T_map_sensor` (4, 4) is given.
         max_range: a longer ray only frees, up to this range, metres; negative for no limit.
-        discretize: one ray a voxel, to its centre: faster, and slightly other rays.
+        discretize: one ray a voxel, to its centre, from the origin of its first point: faster, and
+        slightly other rays.
 
         As OctoMap's `insertPointCloud`: a voxel with a hit is not freed by the same scan.
         """
         starts, ends = self._ray_arrays(origin, points, T_map_sensor)
         if discretize:
-            if len(starts) != 1:
-                raise InputError("discretize needs one origin for all points; there are several")
-            ends = self._discretized(ends)
+            starts, ends = self._discretized(starts, ends)
         if len(ends) == 0:
             return
         state = np.empty(len(ends), np.uint8)
@@ -160,13 +159,23 @@ class Octree:
 
     def leaves(self, *, pruned: bool = True) -> Leaves:
         """Return the leaves in Morton order; not pruned: every known voxel by itself."""
-        n = self._n_blocks
-        order = np.argsort(self._codes[:n], kind="stable")
-        return leaves_of(self.resolution, self._codes, self._values, order, pruned=pruned)
+        return leaves_of(self.resolution, self._codes, self._values, self._order(), pruned=pruned)
+
+    def leaf_parts(self, *, pruned: bool = True) -> LeafParts:
+        """Return the leaves as `leaves` does, made part by part whenever they are gone through.
+
+        `write_octree` takes them: a file costs no more memory than the tree itself.
+        """
+        return LeafParts(
+            self.resolution,
+            lambda: leaf_parts(
+                self.resolution, self._codes, self._values, self._order(), pruned=pruned
+            ),
+        )
 
     def blocks(self) -> Blocks:
         """Return the voxels as blocks sorted by code (a copy)."""
-        order = np.argsort(self._codes[: self._n_blocks], kind="stable")
+        order = self._order()
         return Blocks(self.resolution, self._codes[order], self._values[order])
 
     def count_nodes(self, *, pruned: bool = True) -> int:
@@ -261,11 +270,14 @@ class Octree:
         keys[~inside] = 0
         return morton.encode(keys.astype(np.uint16)), inside
 
-    def _discretized(self, points: Float32s) -> Float32s:
-        """Return the centres of the voxels that hold points, one each."""
+    def _discretized(self, starts: Float32s, points: Float32s) -> tuple[Float32s, Float32s]:
+        """Return origins (1 or M, 3) and the centres (M, 3) of the voxels that hold points."""
         codes, inside = self._codes_at(points)
-        keys = morton.decode(np.unique(codes[inside]))
-        return ((keys.astype(np.float64) - KEY_ORIGIN + 0.5) * self.resolution).astype(np.float32)
+        codes, first = np.unique(codes[inside], return_index=True)
+        centres = (morton.decode(codes).astype(np.float64) - KEY_ORIGIN + 0.5) * self.resolution
+        if len(starts) > 1:
+            starts = starts[inside][first]
+        return starts, centres.astype(np.float32)
 
     def _trace(
         self,
@@ -318,6 +330,10 @@ class Octree:
         scratch.slot_of[cubes] = slots
         kernels.apply_hits(at, scratch.slot_of, scratch.words, self._values, self.hit, *limits)
         scratch.close(cubes)
+
+    def _order(self) -> NDArray[np.int64]:
+        """Return the slots of the blocks in Morton order."""
+        return np.argsort(self._codes[: self._n_blocks], kind="stable")
 
     def _make_slots(self, wanted: NDArray[np.int64]) -> NDArray[np.int32]:
         """Return the slots of block codes; blocks that are not there begin unknown."""

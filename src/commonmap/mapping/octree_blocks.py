@@ -7,6 +7,7 @@ of OctoMap's files, which makes pruning one pass without a search.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numba
@@ -42,6 +43,9 @@ class Blocks:
     values: Float32s
 
 
+PART_BLOCKS = 1024
+"""Blocks whose leaves are made at a time."""
+
 NO_LABELS = np.zeros((0, 0), np.int64)
 
 
@@ -59,7 +63,10 @@ def blocks_to_labelled_leaves(
     labels: (B, 512), one for each voxel of the blocks.
     """
     order = np.arange(len(blocks.codes))
-    return _leaves(blocks.resolution, blocks.codes, blocks.values, labels, order, True)
+    codes, depth, value, label = _fill(blocks.codes, blocks.values, labels, order, True)
+    n = int(morton.join_siblings(codes, depth, value, label))
+    leaves = Leaves(blocks.resolution, morton.decode(codes[:n]), depth[:n].copy(), value[:n].copy())
+    return leaves, label[:n].copy()
 
 
 def leaves_of(
@@ -71,30 +78,58 @@ def leaves_of(
     pruned: bool,
 ) -> Leaves:
     """Return the leaves of the blocks `codes[order]`, `values[order]`; `codes[order]` rises."""
-    return _leaves(resolution, codes, values, NO_LABELS, order, pruned)[0]
+    most = int(_counts(values, NO_LABELS, order, pruned).sum())
+    keys, depth = np.empty((most, 3), np.uint16), np.empty(most, np.uint8)
+    value = np.empty(most, np.float32)
+    n = 0
+    for part in leaf_parts(resolution, codes, values, order, pruned=pruned):
+        some = slice(n, n + len(part.depth))
+        keys[some], depth[some], value[some] = part.keys, part.depth, part.log_odds
+        n = some.stop
+    keys.resize((n, 3), refcheck=False)  # in place: no moment with all leaves twice
+    depth.resize(n, refcheck=False)
+    value.resize(n, refcheck=False)
+    return Leaves(resolution, keys, depth, value)
 
 
-def _leaves(
+def leaf_parts(
     resolution: float,
+    codes: NDArray[np.int64],
+    values: Float32s,
+    order: NDArray[np.int64],
+    *,
+    pruned: bool,
+) -> Iterator[Leaves]:
+    """Yield what `leaves_of` returns, part by part."""
+    runs = (order[n : n + PART_BLOCKS] for n in range(0, len(order), PART_BLOCKS))
+    parts = (_fill(codes, values, NO_LABELS, run, pruned)[:3] for run in runs)
+    for leaf_codes, depth, value in morton.join_parts(parts) if pruned else parts:
+        yield Leaves(resolution, morton.decode(leaf_codes), depth, value)
+
+
+def _counts(
+    values: Float32s, labels: NDArray[np.int64], order: NDArray[np.int64], pruned: bool
+) -> NDArray[np.int64]:
+    counts = np.empty(len(order), np.int64)
+    _count_leaves(values, labels, order, pruned, counts)
+    return counts
+
+
+def _fill(
     codes: NDArray[np.int64],
     values: Float32s,
     labels: NDArray[np.int64],
     order: NDArray[np.int64],
     pruned: bool,
-) -> tuple[Leaves, NDArray[np.int64]]:
-    counts = np.empty(len(order), np.int64)
-    _count_leaves(values, labels, order, pruned, counts)
-    ends = np.cumsum(counts)
-    n = int(ends[-1]) if len(ends) else 0
+) -> tuple[NDArray[np.int64], NDArray[np.uint8], Float32s, NDArray[np.int64]]:
+    """Return code, depth, log-odds and label of the leaves, joined by eight voxels at most."""
+    counts = _counts(values, labels, order, pruned)
+    n = int(counts.sum())
     leaf_codes, depth = np.empty(n, np.int64), np.empty(n, np.uint8)
     value, label = np.empty(n, np.float32), np.zeros(n, np.int64)
-    _fill_leaves(
-        codes, values, labels, order, pruned, ends - counts, leaf_codes, depth, value, label
-    )
-    if pruned:
-        n = int(morton.join_siblings(leaf_codes, depth, value, label))
-        leaf_codes, depth, value = leaf_codes[:n], depth[:n].copy(), value[:n].copy()
-    return Leaves(resolution, morton.decode(leaf_codes), depth, value), label[:n].copy()
+    starts = np.cumsum(counts) - counts
+    _fill_leaves(codes, values, labels, order, pruned, starts, leaf_codes, depth, value, label)
+    return leaf_codes, depth, value, label
 
 
 def hash_blocks(codes: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int32]]:

@@ -32,6 +32,7 @@ def insert_log(
     odometry: Odometry,
     *,
     max_range: float = -1.0,
+    discretize: bool = False,
     shift: Float64s = NO_SHIFT,
     n_scans: int | None = None,
     progress: Progress = no_progress,
@@ -41,7 +42,7 @@ def insert_log(
     Every ray begins where the sensor was at its own moment. A turn is left out where its pose is
     only a guess (odometry was lost) or not known.
     scans: all turns of the log, read once. odometry: the poses of the sensor.
-    max_range: metres, as of `Octree.insert`. shift: (3,) metres, taken from all coordinates.
+    max_range, discretize: as of `Octree.insert`. shift: (3,) metres, taken from all coordinates.
     n_scans: how many there are, where known, for the progress.
     """
     progress("insert the turns")
@@ -49,7 +50,9 @@ def insert_log(
     turns = _Placeable(scans, odometry)
     for cloud in georeference(turns, odometry.trajectory):
         assert cloud.origin is not None
-        tree.insert(cloud.origin - shift, cloud.xyz - shift, max_range=max_range)
+        tree.insert(
+            cloud.origin - shift, cloud.xyz - shift, max_range=max_range, discretize=discretize
+        )
         placed += 1
         n_points += len(cloud.xyz)
         progress("insert the turns", min(turns.n / n_scans, 1.0) if n_scans else 0.0)
@@ -67,6 +70,7 @@ def insert_cloud(
     origin: ArrayLike | None = None,
     poses: Trajectory | None = None,
     max_range: float = -1.0,
+    discretize: bool = False,
     shift: Float64s = NO_SHIFT,
     progress: Progress = no_progress,
 ) -> bool:
@@ -74,7 +78,8 @@ def insert_cloud(
 
     Rays begin at `origin` (3,) metres, one place for all; or where the sensor was by `poses` at the
     time of each point; or at the cloud's own origins. With none of these the points are ends of
-    no rays: occupied voxels, a hit for each point, nothing free, and no max_range.
+    no rays: occupied voxels, a hit for each point, nothing free, and neither
+    max_range nor discretize.
     Points with times go in turn by turn, others as one scan.
     """
     finite = np.isfinite(cloud.xyz).all(axis=1)
@@ -83,9 +88,10 @@ def insert_cloud(
     starts = _origins(cloud, origin, poses)
     xyz = cloud.xyz - shift
     if starts is None:
-        if max_range >= 0:
+        if max_range >= 0 or discretize:
+            option = "max_range" if max_range >= 0 else "discretize"
             raise InputError(
-                "max_range needs to know where the sensor was, and this cloud does not say:"
+                f"{option} needs to know where the sensor was, and this cloud does not say:"
                 " give an origin, or poses"
             )
         progress("insert the points")
@@ -93,7 +99,7 @@ def insert_cloud(
         return False
     turns = list(_turns(cloud, np.flatnonzero(finite)))
     for number, turn in enumerate(turns):
-        tree.insert(starts[turn] - shift, xyz[turn], max_range=max_range)
+        tree.insert(starts[turn] - shift, xyz[turn], max_range=max_range, discretize=discretize)
         progress("insert the points", (number + 1) / len(turns))
     return True
 
