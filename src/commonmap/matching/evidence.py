@@ -379,7 +379,7 @@ SPREAD = _spread_table()
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
-def _count_bits(  # type: ignore[no-untyped-def]
+def count_bits(  # type: ignore[no-untyped-def]
     occupied, known, t_occupied, t_known, i0, j0, n_bytes, spread, lanes
 ):
     """Set lanes (4, 8 n_bytes) to the counts, per bit, of known, mine, other, and mine and other.
@@ -458,7 +458,7 @@ def count_tables(  # type: ignore[no-untyped-def]
             if 0 <= i < n_x and 0 <= j < n_y:
                 occupied[i - i0, j - j0] |= s_occupied[n]
                 known[i - i0, j - j0] |= s_known[n]
-        _count_bits(occupied, known, t_occupied, t_known, i0, j0, (n_slabs + 7) // 8, spread, lanes)
+        count_bits(occupied, known, t_occupied, t_known, i0, j0, (n_slabs + 7) // 8, spread, lanes)
         for k in range(n_slabs):
             for q in range(4):
                 out[p, k, q] = lanes[q, k]

@@ -1,21 +1,22 @@
 """The search over x, y and yaw, full circle, without an initial guess.
 
 At a coarse cell every pose is scored exactly by FFT, tile by tile (`tiles.py`); the best separate
-peaks then descend through cells half as wide, each climbing to its local maximum. The mirrored
-source goes the same way in the same call: its best score is a draw of what chance alone reaches
-(the decoy).
+peaks then descend through cells half as wide, each climbing to its local maximum (`climb.py`). On
+the last cell those that are close to the best climb once more, from everywhere about them. The
+mirrored source goes the same way in the same call: its best score is a draw of what chance alone
+reaches (the decoy).
 """
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
-import numba
 import numpy as np
 
 from commonmap.config import ComputeConfig
 from commonmap.frames import from_xyz_yaw
+from commonmap.matching.climb import HERE, climb_all, starts_around
 from commonmap.matching.evidence import (
     Columns,
     SlabGrid,
@@ -28,8 +29,11 @@ from commonmap.matching.evidence import (
 from commonmap.matching.tiles import Level, Sweep, find_level, plan_tiles, search_tiles
 from commonmap.types import Float64s, Progress, no_progress
 
-MOST_STEPS = 12
-"""Steps that a pose climbs on one cell at most."""
+CLOSE = 0.8
+"""Peaks with at least this share of the best evidence climb from everywhere about them."""
+
+MOST_CLOSE = 8
+"""Peaks that do so at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,21 +128,32 @@ def search(
 
     # Each candidate climbs at this cell, then at half of it, and so on
     step = 2.0 * np.pi / plan.n_yaw
-    overlap = np.zeros(len(pose))
     for n, cell in enumerate(plan.cells):
         if n > 0:
             columns = centre_columns(_columns_at(source, target, cell), centre, mirrored=mirrored)
             level = find_level(target, round(cell / target.cell), compute)
         yaw_step = step * cell / plan.cells[0] / 2.0
-        pose, score, overlap = _climb_all(
-            level, columns, pose, 0.5 * cell, yaw_step, min_overlap, workers
-        )
+        n_known = _known_cells(columns, cell)
+        climb = partial(
+            climb_all, level, columns, yaw_step=yaw_step, least_pairs=min_overlap * n_known,
+            workers=workers,
+        )  # fmt: skip
+        pose, score, pairs = climb(pose, starts=starts_around(2, 1) if n > 0 else HERE)
         last = n == len(plan.cells) - 1
         keep = n_peaks if last else plan.keep[n + 1]
         apart = 2.0 * cell if not last else 4.0 * finest
         order = separate(pose, score, apart, (6.0 if last else 2.0) * yaw_step, keep)
-        pose, score, overlap = pose[order], score[order], overlap[order]
-    return Peaks(pose, score, overlap, centre, per_yaw, finest)
+        pose, score, pairs = pose[order], score[order], pairs[order]
+
+    # The best and those close to it, each from the starts about it
+    close = pose[score >= CLOSE * score.max(initial=0.0)][:MOST_CLOSE]
+    again = climb(close, starts=starts_around(1, 1, apart=2), each=True)
+    pose, score, pairs = (
+        np.concatenate([new, old]) for new, old in zip(again, (pose, score, pairs), strict=True)
+    )
+    order = separate(pose, score, 4.0 * finest, 6.0 * yaw_step, n_peaks)
+    overlap = np.minimum(pairs[order] / max(n_known, 1), 1.0)
+    return Peaks(pose[order], score[order], overlap, centre, per_yaw, finest)
 
 
 def evidence_at(target: SlabGrid, columns: Columns, pose: Float64s) -> tuple[float, int]:
@@ -236,99 +251,3 @@ def separate(
         if len(kept) == n:
             break
     return np.array(kept, dtype=np.int64)
-
-
-def _climb_all(
-    level: Level,
-    columns: Columns,
-    pose: Float64s,
-    step: float,
-    yaw_step: float,
-    min_overlap: float,
-    workers: int,
-) -> tuple[Float64s, Float64s, Float64s]:
-    """Return every pose moved to its local maximum on this level, with score and overlap."""
-    n_known = _known_cells(columns, level.cell)
-    table = xlogx_table(2 * n_known + 64)
-    reach = float(np.hypot(*columns.xy.T).max()) + MOST_STEPS * step
-    n_blocks = min(len(pose), 4 * workers) if level.whole is not None else len(pose)
-    blocks = np.array_split(np.arange(len(pose)), max(1, n_blocks))
-
-    def climb(block: np.ndarray[tuple[int], np.dtype[np.int64]]) -> Float64s:
-        if len(block) == 0:
-            return np.zeros((0, 5))
-        window, first_i, first_j = level.around(pose[block], reach)
-        return np.asarray(
-            _climb(
-                window.occupied, window.known, level.origin, level.cell, columns.xy,
-                columns.occupied, columns.known, columns.n_slabs, pose[block], step, yaw_step,
-                min_overlap * n_known, table, first_i, first_j,
-            )
-        )  # fmt: skip
-
-    with ThreadPoolExecutor(max_workers=workers) as pool:
-        rows = np.concatenate([np.zeros((0, 5)), *pool.map(climb, blocks)])
-    return rows[:, :3], rows[:, 3], np.minimum(rows[:, 4] / max(n_known, 1), 1.0)
-
-
-@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
-def _climb(  # type: ignore[no-untyped-def]
-    t_occupied, t_known, origin, cell, xy, s_occupied, s_known, n_slabs, poses, step, yaw_step,
-    min_pairs, xlogx, first_i, first_j,
-):  # fmt: skip
-    """Return (P, 5) x, y, yaw, score, pairs after climbing in steps of `step` and `yaw_step`.
-
-    A climb walks on a lattice about where it starts; a node is counted once.
-    """
-    out = np.empty((poses.shape[0], 5))
-    size = 2 * MOST_STEPS + 1
-    for p in range(poses.shape[0]):
-        seen = np.zeros((size, size, size), np.bool_)
-        trial, node = np.empty((27, 3)), np.empty((27, 3), np.int64)
-        at = np.full(3, MOST_STEPS)
-        pose = poses[p].copy()
-        best, pairs = -np.inf, 0.0
-        for _ in range(MOST_STEPS):
-            n_trials = 0
-            for c in range(at[2] - 1, at[2] + 2):
-                for a in range(at[0] - 1, at[0] + 2):
-                    for b in range(at[1] - 1, at[1] + 2):
-                        if seen[a, b, c]:
-                            continue
-                        seen[a, b, c] = True
-                        node[n_trials, 0], node[n_trials, 1], node[n_trials, 2] = a, b, c
-                        trial[n_trials, 0] = poses[p, 0] + (a - MOST_STEPS) * step
-                        trial[n_trials, 1] = poses[p, 1] + (b - MOST_STEPS) * step
-                        trial[n_trials, 2] = poses[p, 2] + (c - MOST_STEPS) * yaw_step
-                        n_trials += 1
-            tables = count_tables(
-                t_occupied,
-                t_known,
-                origin,
-                cell,
-                xy,
-                s_occupied,
-                s_known,
-                n_slabs,
-                trial[:n_trials],
-                first_i,
-                first_j,
-            )
-            winner = -1
-            for m in range(n_trials):
-                most = 0
-                total = 0.0
-                for k in range(n_slabs):
-                    n, r, c, n11 = tables[m, k]
-                    most = max(most, n)
-                    total += signed_evidence(n, r, c, n11, xlogx)
-                if most < min_pairs:
-                    continue
-                if total > best + 1e-9:
-                    best, winner, pairs = total, m, float(most)
-            if winner < 0:
-                break  # nothing about is better
-            at[:] = node[winner]
-            pose[:] = trial[winner]
-        out[p, :3], out[p, 3], out[p, 4] = pose, best, pairs
-    return out
