@@ -7,21 +7,19 @@ import math
 import numpy as np
 import pytest
 
-from commonmap.config import ComputeConfig
 from commonmap.mapping.ground import find_ground
 from commonmap.mapping.height_map import build_height_map
 from commonmap.matching.evidence import Columns, SlabGrid, list_columns, pack_slabs
 from commonmap.matching.search import (
     Peaks,
     SearchPlan,
-    _climb_all,
     evidence_at,
     plan_search,
     search,
     separate,
 )
 from commonmap.matching.search_metric import scatter_heights, search_metric
-from commonmap.matching.tiles import find_level, local_maxima
+from commonmap.matching.tiles import local_maxima
 from commonmap.types import Float64s, Floats, GridMap
 from matching_scenes import apart, look, make_place, moved, rigid
 
@@ -82,8 +80,8 @@ def test_coarse_to_fine_finds_what_the_exhaustive_search_finds(seed: int) -> Non
     quick = search(
         base, draft, min_overlap=0.3, workers=1, plan=SearchPlan((1.0, 0.5), 44, (256, 64))
     )
-    # both climb on the same grid in nearly the same steps
-    assert quick.score[0] >= 0.97 * exhaustive.score[0]
+    # both climb on the same lattice
+    assert quick.score[0] >= exhaustive.score[0] * (1.0 - 1e-9)
     delta = quick.pose[0] - exhaustive.pose[0]
     assert np.hypot(delta[0], delta[1]) < 0.5
     assert abs((delta[2] + math.pi) % (2 * math.pi) - math.pi) < math.radians(3.0)
@@ -245,24 +243,6 @@ def test_separate_keeps_the_best_of_each_neighbourhood() -> None:
     assert separate(pose, score, 1.0, 0.05, 9).tolist() == [1, 4, 2]
     assert separate(pose, score, 1.0, 0.5, 1).tolist() == [1]
     assert separate(pose[:0], score[:0], 1.0, 0.5, 3).tolist() == []
-
-
-def test_climbing_never_goes_down() -> None:
-    target, source, T = small_pair(13)
-    grid, draft = coarse(slabs(target)), slabs(source)
-    columns = list_columns(draft)
-    centre = 0.5 * (columns.xy.min(axis=0) + columns.xy.max(axis=0))
-    columns = about(columns, centre)
-    at = moved(T, np.array([[*centre, 0.0]]))[0, :2]
-    yaw = math.atan2(T[1, 0], T[0, 0])
-    rng = np.random.default_rng(14)
-    starts = np.column_stack([at + rng.normal(0, 0.4, (12, 2)), yaw + rng.normal(0, 0.03, 12)])
-    pose, score, _ = _climb_all(
-        find_level(grid, 1, ComputeConfig()), columns, starts, 0.25, 0.02, 0.2, 1
-    )
-    for k in range(len(starts)):
-        assert score[k] >= evidence_at(grid, columns, starts[k])[0] - 1e-6
-        assert score[k] == pytest.approx(evidence_at(grid, columns, pose[k])[0], rel=1e-9)
 
 
 @pytest.mark.parametrize(

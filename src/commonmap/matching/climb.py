@@ -182,9 +182,11 @@ def _score(  # type: ignore[no-untyped-def]
             j = int(np.floor((sine * xy[n, 0] + cosine * xy[n, 1] + dy) / cell)) - j0
             laid[slot, 0, i, j] |= s_occupied[n]
             laid[slot, 1, i, j] |= s_known[n]
+    i0 += (a - middle) // 2 - first_i
+    j0 += (b - middle) // 2 - first_j
     count_bits(
-        laid[slot, 0], laid[slot, 1], t_occupied, t_known, i0 + (a - middle - half_a) // 2 - first_i,
-        j0 + (b - middle - half_b) // 2 - first_j, lanes.shape[1] // 8, SPREAD, lanes,
+        laid[slot, 0], laid[slot, 1], t_occupied, t_known, i0, j0, lanes.shape[1] // 8, SPREAD,
+        lanes,
     )  # fmt: skip
     most = 0
     total = 0.0

@@ -1,0 +1,140 @@
+"""Climbing: scored as pose by pose, never down, and from all starts as good as from the best."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from commonmap.config import ComputeConfig
+from commonmap.matching.climb import HERE, climb_all, starts_around
+from commonmap.matching.evidence import Columns, SlabGrid
+from commonmap.matching.search import evidence_at
+from commonmap.matching.tiles import find_level
+from commonmap.types import Float64s
+
+CELL = 0.5
+IN_WINDOWS = ComputeConfig(memory_gb=1e-9)
+
+
+def scene(seed: int, n_slabs: int = 3) -> tuple[SlabGrid, Columns]:
+    """Return a target of 40 x 36 cells with holes, and columns about their middle."""
+    rng = np.random.default_rng(seed)
+    full = (1 << n_slabs) - 1
+    known = np.where(rng.uniform(size=(40, 36)) < 0.8, full, 0).astype(np.uint32)
+    blobs = np.kron(rng.integers(0, full + 1, (10, 9)), np.ones((4, 4), int))
+    occupied = (blobs & rng.integers(0, full + 1, (40, 36))).astype(np.uint32) & known
+    target = SlabGrid(np.array([-3.0, 2.0]), CELL, occupied, known, n_slabs)
+    i, j = np.indices((24, 20)).reshape(2, -1)
+    xy = (np.column_stack([i - 11.5, j - 9.5])) * 0.5 * CELL
+    # what the target holds about (7, 11), as a part of it would be seen
+    at = np.floor((xy + np.array([7.0, 11.0]) - target.origin) / CELL).astype(int)
+    seen, there = known[at[:, 0], at[:, 1]], occupied[at[:, 0], at[:, 1]]
+    return target, Columns(xy, there, seen, n_slabs)
+
+
+def evidence(target: SlabGrid, columns: Columns, pose: Float64s) -> float:
+    """Return the evidence at a pose, counted pose by pose."""
+    return evidence_at(target, columns, pose)[0]
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("each", [False, True])
+def test_a_top_scores_what_its_pose_does_and_no_start_scores_more(seed: int, each: bool) -> None:
+    target, columns = scene(seed)
+    rng = np.random.default_rng(seed)
+    poses = np.column_stack([rng.uniform(5, 9, 6), rng.uniform(9, 13, 6), rng.normal(0, 0.3, 6)])
+    starts = starts_around(1, 1, apart=2)
+    level = find_level(target, 1, ComputeConfig())
+    tops, score, pairs = climb_all(
+        level, columns, poses, yaw_step=0.05, least_pairs=1.0, starts=starts, each=each
+    )
+    for pose, top, told, n in zip(poses, tops, score, pairs, strict=True):
+        expected, n_expected = evidence_at(target, columns, top)
+        assert told == pytest.approx(expected, rel=1e-9, abs=1e-9)
+        assert n == n_expected
+        about = pose + starts * np.array([0.5 * CELL, 0.5 * CELL, 0.05])
+        assert told >= max(evidence(target, columns, start) for start in about) - 1e-9
+        # none of the 26 nodes about a top is higher
+        steps = np.array(list(itertools.product((-1, 0, 1), repeat=3)))
+        nodes = top + steps * np.array([0.5 * CELL, 0.5 * CELL, 0.05])
+        assert told >= max(evidence(target, columns, node) for node in nodes) - 1e-9
+
+
+def test_it_takes_the_way_up_that_a_slow_climb_takes() -> None:
+    target, columns = scene(5)
+    level = find_level(target, 1, ComputeConfig())
+    steps = np.array(list(itertools.product((-1, 0, 1), repeat=3)))
+    for start in ((6.1, 11.7, 0.2), (8.0, 10.2, -0.3), (7.3, 11.1, 0.1)):
+        pose = np.array(start)
+        while True:
+            about = pose + steps * np.array([0.5 * CELL, 0.5 * CELL, 0.04])
+            scores = [evidence(target, columns, node) for node in about]
+            if max(scores) <= evidence(target, columns, pose) + 1e-9:
+                break
+            pose = about[int(np.argmax(scores))]
+        top, _, _ = climb_all(
+            level, columns, np.array([start]), yaw_step=0.04, least_pairs=1.0, starts=HERE
+        )
+        assert top[0] == pytest.approx(pose, abs=1e-9)
+
+
+def test_all_starts_together_are_as_good_as_the_best_of_them() -> None:
+    target, columns = scene(6)
+    level = find_level(target, 1, ComputeConfig())
+    pose = np.array([[6.3, 12.0, 0.3]])
+    starts = starts_around(1, 1)
+    _, together, _ = climb_all(
+        level, columns, pose, yaw_step=0.05, least_pairs=1.0, starts=starts, each=True
+    )
+    alone = [
+        climb_all(level, columns, pose, yaw_step=0.05, least_pairs=1.0, starts=start[None])[1][0]
+        for start in starts
+    ]
+    assert together[0] == pytest.approx(max(alone), rel=1e-12)
+    assert together[0] > min(alone) + 1.0
+
+
+@pytest.mark.parametrize("each", [False, True])
+def test_windows_and_workers_change_nothing(each: bool) -> None:
+    target, columns = scene(7)
+    rng = np.random.default_rng(7)
+    # some beyond the target
+    poses = np.column_stack([rng.uniform(-8, 22, 9), rng.uniform(-4, 24, 9), rng.uniform(-3, 3, 9)])
+    answers = []
+    for compute, workers in ((ComputeConfig(), 1), (ComputeConfig(), 2), (IN_WINDOWS, 1)):
+        level = find_level(target, 1, compute)
+        assert (level.whole is None) == (compute is IN_WINDOWS)
+        answers.append(
+            climb_all(
+                level, columns, poses, yaw_step=0.05, least_pairs=5.0,
+                starts=starts_around(2, 1), each=each, workers=workers,
+            )
+        )  # fmt: skip
+    for other in answers[1:]:
+        for a, b in zip(answers[0], other, strict=True):
+            assert np.array_equal(a, b)
+    assert not np.isfinite(answers[0][1]).all()  # nothing known where they are
+
+
+def test_too_few_pairs_score_nothing() -> None:
+    target, columns = scene(8)
+    level = find_level(target, 1, ComputeConfig())
+    pose = np.array([[7.0, 11.0, 0.0]])
+    top, score, _ = climb_all(
+        level, columns, pose, yaw_step=0.05, least_pairs=1e6, starts=starts_around(1, 1)
+    )
+    assert score[0] == -np.inf
+    assert np.array_equal(top, pose)
+
+
+def test_starts_are_whole_cells_and_yaws_apart_the_pose_first() -> None:
+    starts = starts_around(1, 2, apart=3)
+    assert starts.shape == (45, 3)
+    assert starts[0].tolist() == [0, 0, 0]
+    assert sorted({tuple(s) for s in starts[:, :2].tolist()}) == list(
+        itertools.product((-2, 0, 2), repeat=2)
+    )
+    assert sorted(set(starts[:, 2].tolist())) == [-12, -6, 0, 6, 12]
+    assert HERE.tolist() == [[0, 0, 0]]
