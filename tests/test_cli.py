@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,7 +20,9 @@ from commonmap import cli, cli_results, pipeline
 from commonmap.errors import InputError
 from commonmap.frames import apply, difference, from_xyz_yaw, invert
 from commonmap.io import read_cloud, read_geotiff, read_map, write_cloud
+from commonmap.io.logs import iter_scans
 from commonmap.io.trajectory import read_trajectory
+from commonmap.sim.logs import write_kitti
 from commonmap.types import Candidate, Cloud, Float64s, Leaves, Match
 
 T_TRUE = from_xyz_yaw(7.0, -4.0, 1.5, 2.2)
@@ -636,3 +639,71 @@ def test_faults_of_logs_are_one_sentence(logs: Path, tmp_path: Path, run: Run) -
 def test_odometry_of_maps_is_told(folder: Path, tmp_path: Path, run: Run) -> None:
     words = ("run", folder / "base.ply", folder / "draft.ply", "-o", tmp_path / "o")
     told(run(*words, "--odometry", "loam"), "raw logs")
+
+
+def test_what_is_left_of_a_bag_is_read_where_it_is_asked_for(
+    logs: Path, tmp_path: Path, run: Run
+) -> None:
+    data = (logs / "ugv" / "log.mcap").read_bytes()
+    broken = tmp_path / "broken.mcap"
+    broken.write_bytes(data[: len(data) * 4 // 5])
+    way = tmp_path / "way.tum"
+    told(run("odometry", broken, "-o", way, "-q"), "broken.mcap", "--keep-partial")
+    assert not way.exists()
+    for more in ([], ["--odometry", "poses"]):
+        done = run("odometry", broken, "-o", way, "--keep-partial", *more)
+        assert done.code == 0, done.err
+        assert "damaged" in done.err and 8 < len(read_trajectory(way).time) < 15
+    assert "bag" in run("info", broken).out
+
+
+def test_poses_of_a_topic_and_of_a_folder(logs: Path, tmp_path: Path, run: Run) -> None:
+    way = tmp_path / "way.tum"
+    done = run("odometry", logs / "ugv" / "log.mcap", "-o", way, "--poses", "/odom", "-q")
+    assert done.code == 0, done.err
+    true = read_trajectory(logs / "ugv" / "truth.tum")
+    # the poses are taken as they are
+    assert read_trajectory(way).T_map_sensor[0] == pytest.approx(true.T_map_sensor[0], abs=0.05)
+    told(run("odometry", logs / "ugv" / "log.mcap", "-o", way, "--poses", "/odo"), "/odo")
+
+    scans = list(iter_scans(logs / "ugv" / "log.pcap"))
+    write_kitti(tmp_path / "kitti", scans)
+    words = ("odometry", tmp_path / "kitti", "-o", way, "-q", "--odometry", "poses")
+    told(run(*words), "holds no poses")
+    shutil.copy(logs / "ugv" / "truth.tum", tmp_path / "kitti" / "truth.tum")
+    assert run(*words).code == 0
+    assert "truth.tum" in run("info", tmp_path / "kitti").out
+    # KITTI keeps all poses in one folder: times and calibration are those of the scans
+    rows = [" ".join(f"{x:.9g}" for x in T[:3].ravel()) for T in true.T_map_sensor[::5]]
+    (tmp_path / "kitti" / "calib.txt").write_text("Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n")
+    (tmp_path / "00.txt").write_text("\n".join(rows[: len(scans)]) + "\n")
+    done = run(*words[:-2], "--poses", tmp_path / "00.txt")
+    assert done.code == 0, done.err
+
+
+def test_a_scan_that_is_cut_short_is_left_out_where_it_is_asked_for(
+    logs: Path, tmp_path: Path, run: Run
+) -> None:
+    folder, way = tmp_path / "kitti", tmp_path / "way.tum"
+    write_kitti(folder, list(iter_scans(logs / "ugv" / "log.pcap")))
+    cut = folder / "velodyne" / "000007.bin"
+    cut.write_bytes(cut.read_bytes()[:-7])
+    (folder / "ring" / "000009.npy").unlink()
+    told(run("odometry", folder, "-o", way, "-q"), "000009.npy is missing")
+    done = run("odometry", folder, "-o", way, "--keep-partial")
+    assert done.code == 0, done.err
+    assert "000007.bin is truncated" in done.err and len(read_trajectory(way).time) == 13
+
+
+def test_model_and_deskewing_are_options(logs: Path, tmp_path: Path, run: Run) -> None:
+    way, pcap = tmp_path / "way.tum", logs / "ugv" / "log.pcap"
+    told(run("odometry", pcap, "-o", way, "--model", "vlp-17"), "vlp-16", "'vlp-17'")
+    assert run("odometry", pcap, "-o", way, "-q", "--model", "VLP-16").code == 0
+    folder = tmp_path / "bin" / "velodyne"
+    folder.mkdir(parents=True)
+    for i, scan in enumerate(iter_scans(pcap)):
+        np.column_stack([scan.xyz, scan.intensity]).tofile(folder / f"{i:06d}.bin")
+    done = run("odometry", tmp_path / "bin", "-o", way, "--not-deskewed")
+    assert done.code == 0 and "told from their azimuth" in done.err
+    done = run("odometry", tmp_path / "bin", "-o", way, "--deskewed")
+    assert done.code == 0 and "told from their azimuth" not in done.err

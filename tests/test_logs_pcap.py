@@ -225,7 +225,7 @@ def test_two_sensors_are_told_apart(tmp_path: Path) -> None:
     path = tmp_path / "a.pcap"
     write_classic(path, both)
     assert open_log(path).topic is None
-    with pytest.raises(InputError, match=r"give topic: .*192.168.1.201:2368.*192.168.1.202:2368"):
+    with pytest.raises(InputError, match=r"\(--topic\): .*192.168.1.201:2368.*192.168.1.202:2368"):
         iter_scans(path)
     for name, scans in (("192.168.1.201:2368", one), ("192.168.1.202:2368", two)):
         for got, wanted in zip(iter_scans(path, topic=name), scans, strict=True):

@@ -69,13 +69,27 @@ OdometryMethod = Annotated[
 ]
 Poses = Annotated[
     list[Path] | None,
-    typer.Option("--poses", help="Raw logs: known poses (TUM, KITTI, bag), one a log, in order."),
+    typer.Option(
+        "--poses", help="Raw logs: known poses (TUM, KITTI, bag, topic), one a log, in order."
+    ),
 ]
 Topic = Annotated[
     list[str] | None, typer.Option("--topic", help="Raw logs: topic of the scans, one a log.")
 ]
 KeepPartial = Annotated[
     bool, typer.Option("--keep-partial", help="Raw logs: keep what can be read of a damaged one.")
+]
+Model = Annotated[
+    str | None,
+    typer.Option(metavar="NAME", help="Raw packets that do not say it: model of the Velodyne."),
+]
+Deskewed = Annotated[
+    bool | None,
+    typer.Option(
+        "--deskewed/--not-deskewed",
+        help="Raw logs without times: whether each turn was moved to one moment.",
+        show_default="looked for",
+    ),
 ]
 Scheduler = Annotated[
     str | None,
@@ -139,6 +153,8 @@ def run_command(
     odometry: OdometryMethod = None,
     poses: Poses = None,
     topic: Topic = None,
+    model: Model = None,
+    deskewed: Deskewed = None,
     keep_partial: KeepPartial = False,
     quiet: Quiet = False,
 ) -> int:
@@ -152,7 +168,10 @@ def run_command(
 
     cli_results.check_folder(out)
     with _notes(quiet), telling(quiet=quiet) as progress:
-        target, source = _take_both(base, draft, odometry, poses, topic, keep_partial, progress)
+        target, source = _take_both(
+            base, draft, progress, method=odometry, poses=poses or [], topics=topic or [],
+            model=model, deskewed=deskewed, keep_partial=keep_partial,
+        )  # fmt: skip
         result = pipeline.run(target.map, source.map, config=settings, progress=progress)
         progress("write the results")
         with cli_results.results_folder(out) as part:
@@ -185,6 +204,8 @@ def match_command(
     odometry: OdometryMethod = None,
     poses: Poses = None,
     topic: Topic = None,
+    model: Model = None,
+    deskewed: Deskewed = None,
     keep_partial: KeepPartial = False,
     quiet: Quiet = False,
 ) -> int:
@@ -200,7 +221,10 @@ def match_command(
     if out is not None:
         cli_results.check_file(out)
     with _notes(quiet), telling(quiet=quiet) as progress:
-        target, source = _take_both(base, draft, odometry, poses, topic, keep_partial, progress)
+        target, source = _take_both(
+            base, draft, progress, method=odometry, poses=poses or [], topics=topic or [],
+            model=model, deskewed=deskewed, keep_partial=keep_partial,
+        )  # fmt: skip
         found = pipeline.match_maps(target.map, source.map, config=settings, progress=progress)
     values = cli_results.match_to_dict(
         found, config=settings, names=(base.name, draft.name),
@@ -267,9 +291,11 @@ def odometry_command(
     ] = None,
     odometry: OdometryMethod = None,
     poses: Annotated[
-        Path | None, typer.Option("--poses", help="Known poses (TUM, KITTI, bag).")
+        Path | None, typer.Option("--poses", help="Known poses: TUM, KITTI, bag, or topic.")
     ] = None,
     topic: Annotated[str | None, typer.Option(help="Topic of the scans.")] = None,
+    model: Model = None,
+    deskewed: Deskewed = None,
     keep_partial: KeepPartial = False,
     quiet: Quiet = False,
 ) -> int:
@@ -288,7 +314,7 @@ def odometry_command(
             cli_results.check_file(path)
     if cloud is not None and find_writer(cloud).holds != "cloud":
         raise InputError(f"--cloud is a file of points; {cloud} came")
-    options = cli_logs.LogOptions(odometry, poses, topic, keep_partial)
+    options = cli_logs.LogOptions(odometry, poses, topic, keep_partial, model, deskewed)
     options.chosen()
     with _notes(quiet), telling(quiet=quiet) as progress:
         known = None if truth is None else read_poses(truth)
@@ -543,23 +569,17 @@ def _read_both(base: Path, draft: Path, progress: Any) -> tuple[Cloud | Leaves, 
     return target, read_map(draft)
 
 
-def _take_both(
-    base: Path, draft: Path, method: str | None, poses: list[Path] | None,
-    topics: list[str] | None, keep_partial: bool, progress: Any,
-) -> tuple[Input, Input]:  # fmt: skip
+def _take_both(base: Path, draft: Path, progress: Any, **options: Any) -> tuple[Input, Input]:
     """Return both inputs as maps; raw logs go through odometry first."""
     from commonmap import cli_beside, cli_logs
 
     for path in (base, draft):
         if not path.exists():
             raise InputError(f"there is no file {path}")
-    options = cli_logs.options_of_both(
-        [base, draft], method=method, poses=poses or [], topics=topics or [],
-        keep_partial=keep_partial,
-    )  # fmt: skip
-    for one in options:
+    each = cli_logs.options_of_both([base, draft], **options)
+    for one in each:
         one.chosen()
-    return cli_beside.take_both([base, draft], options, progress)
+    return cli_beside.take_both([base, draft], each, progress)
 
 
 def _say_errors(name: str, errors: TrajectoryErrors) -> None:

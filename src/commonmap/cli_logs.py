@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from commonmap.errors import InputError
 from commonmap.io.formats import read_map
-from commonmap.io.logs import find_log, iter_scans, open_log, read_acceleration, read_poses
+from commonmap.io.logs import (
+    Log,
+    find_log,
+    iter_scans,
+    open_log,
+    read_acceleration,
+    read_poses,
+)
 from commonmap.odometry import ODOMETRY
 from commonmap.pipeline_logs import RobotMap, map_log
-from commonmap.types import Cloud, Leaves, Progress, Trajectory
+from commonmap.types import Cloud, Leaves, Progress, Scan, Trajectory
 
 log = logging.getLogger("commonmap")
 
@@ -21,16 +28,30 @@ DEFAULT_METHOD = "loam"
 
 @dataclass(frozen=True)
 class LogOptions:
-    """How a log is read and turned into a map. topic: of its scans. poses: file with known poses.
+    """How a log is read and turned into a map. topic: of its scans. poses: file with known poses,
+    or a topic of the bag that holds them.
 
     method: a row of `ODOMETRY`, None takes "poses" where a file is given and LOAM else.
-    keep_partial: keep what can be read of a damaged log.
+    keep_partial: keep what can be read of a damaged log. model, deskewed: see `iter_scans`.
     """
 
     method: str | None = None
     poses: Path | None = None
     topic: str | None = None
     keep_partial: bool = False
+    model: str | None = None
+    deskewed: bool | None = None
+
+    def scans(self, path: Path) -> Iterator[Scan]:
+        """Yield the scans of a log."""
+        return iter_scans(
+            path, topic=self.topic, model=self.model, keep_partial=self.keep_partial,
+            deskewed=self.deskewed,
+        )  # fmt: skip
+
+    def open(self, path: Path) -> Log:
+        """Return what is known of a log before it is read."""
+        return open_log(path, topic=self.topic, model=self.model, keep_partial=self.keep_partial)
 
     def chosen(self) -> str:
         """Return the method, checked."""
@@ -58,7 +79,7 @@ def is_log(path: Path) -> bool:
 
 def options_of_both(
     paths: Sequence[Path], *, method: str | None, poses: Sequence[Path], topics: Sequence[str],
-    keep_partial: bool,
+    keep_partial: bool = False, model: str | None = None, deskewed: bool | None = None,
 ) -> list[LogOptions]:  # fmt: skip
     """Return how each input is read: files of poses, and topics, belong to the logs in turn."""
     logs = [path for path in paths if is_log(path)]
@@ -76,7 +97,7 @@ def options_of_both(
             options.append(
                 LogOptions(
                     method, poses[k] if poses else None, topics[k] if topics else None,
-                    keep_partial,
+                    keep_partial, model, deskewed,
                 )
             )  # fmt: skip
             k += 1
@@ -99,12 +120,15 @@ def take(path: Path, options: LogOptions, progress: Progress) -> Input:
 def take_log(path: Path, options: LogOptions, progress: Progress) -> RobotMap:
     """Return the level map of a raw log; what the user should know of it is told as notes."""
     method = options.chosen()
-    found = open_log(path, topic=options.topic, keep_partial=options.keep_partial)
+    known = _poses(path, options) if method == "poses" else None
+    acceleration = None
+    if method != "poses":
+        acceleration = read_acceleration(
+            path, topic=options.topic, keep_partial=options.keep_partial
+        )
     robot = map_log(
-        lambda: iter_scans(path, topic=options.topic, keep_partial=options.keep_partial),
-        method=method, poses=_poses(path, options) if method == "poses" else None,
-        acceleration=None if method == "poses" else read_acceleration(path),
-        n_scans=found.n_scans, name=path.name, progress=progress,
+        lambda: options.scans(path), method=method, poses=known, acceleration=acceleration,
+        n_scans=options.open(path).n_scans, name=path.name, progress=progress,
     )  # fmt: skip
     for note in robot.notes:
         log.warning("%s: %s", path.name, note)
@@ -113,8 +137,14 @@ def take_log(path: Path, options: LogOptions, progress: Progress) -> RobotMap:
 
 def _poses(path: Path, options: LogOptions) -> Trajectory:
     """Return the known poses of a log: of the file that was given, else its own."""
+    found = options.open(path)
+    partial = options.keep_partial
     if options.poses is not None:
-        return read_poses(options.poses)
-    if not open_log(path).poses:
+        topic = str(options.poses)
+        if not options.poses.exists() and topic in found.poses:
+            return read_poses(path, topic=topic, keep_partial=partial)
+        beside = path if path.is_dir() else None
+        return read_poses(options.poses, beside=beside, keep_partial=partial)
+    if not found.poses:
         raise InputError(f"{path} holds no poses itself; give a file of poses: --poses FILE")
-    return read_poses(path)
+    return read_poses(path, keep_partial=partial)

@@ -12,7 +12,7 @@ import numpy as np
 from commonmap import cli_logs
 from commonmap.errors import EmptyMapError, InputError
 from commonmap.io.formats import read_map
-from commonmap.io.logs import iter_scans, open_log, read_poses
+from commonmap.io.logs import read_poses
 from commonmap.io.octomap import write_octree
 from commonmap.mapping.octree import Octree, probability
 from commonmap.mapping.octree_build import insert_cloud, insert_log
@@ -126,9 +126,9 @@ def _fill_from_log(tree: Octree, path: Path, options: Options, progress: Progres
     places = robot.trajectory.T_map_sensor[:, :3, 3]
     shift = _choose_shift(np.vstack([places - LIDAR_REACH, places + LIDAR_REACH]), tree)
     left_out = insert_log(
-        iter_scans(path, topic=options.topic, keep_partial=options.keep_partial), tree,
+        how.scans(path), tree,
         robot.odometry, max_range=options.reach, discretize=options.discretize, shift=shift,
-        n_scans=open_log(path, topic=options.topic, keep_partial=options.keep_partial).n_scans,
+        n_scans=how.open(path).n_scans,
         progress=progress,
     )  # fmt: skip
     told = f"{robot.n_turns - left_out} of {robot.n_turns} turns over {robot.way:.1f} m"

@@ -105,7 +105,8 @@ def write_log(
         rng, step = np.random.default_rng(seed), f"record {path.parent.name}"
         return record(mission, world, VLP16, rng=rng, seconds=seconds, step=step, progress=progress)
 
-    write_logs(path.parent, turns, mission.sensor, VLP16, [path.suffix.removeprefix(".")])
+    kind = path.suffix.removeprefix(".")
+    write_logs(path.parent, turns, mission.sensor, VLP16, [kind], seconds=seconds)
 
 
 def map_file(path: Path, *, method: str, progress: Progress) -> RobotMap:

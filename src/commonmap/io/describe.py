@@ -127,29 +127,33 @@ def _of_octree(leaves: Leaves) -> dict[str, Any]:
 
 
 def _of_log(path: Path) -> dict[str, Any]:
-    record = open_log(path)
+    # what a damaged log still holds; that it is damaged is a warning
+    record = open_log(path, keep_partial=True)
     if record.kind == "pcap" and record.topic is not None:
         n_scans, span = survey_capture(record, record.topic)
         record = replace(record, n_scans=n_scans, time_span=span)
     chosen = record.topic is not None or not record.topics
-    first = next(iter_scans(path)) if chosen else None
+    first = next(iter_scans(path, keep_partial=True)) if chosen else None
     files = [file for file in path.rglob("*") if file.is_file()] if path.is_dir() else [path]
-    return {
-        "kind": "scans",
-        "format": record.kind,
-        "bytes": sum(file.stat().st_size for file in files),
-        "scans": record.n_scans,
-        "points_first": None if first is None else len(first.xyz),
-        "rings": None if first is None else len(np.unique(first.ring)),
-        "time_span": None if record.time_span is None else list(record.time_span),
-    } | (
-        {}
-        if not record.topics
-        else {
-            "topics": [f"{topic.name} ({topic.type})" for topic in record.topics],
-            "topic": record.topic,
-            "poses": list(record.poses),
+    return (
+        {
+            "kind": "scans",
+            "format": record.kind,
+            "bytes": sum(file.stat().st_size for file in files),
+            "scans": record.n_scans,
+            "points_first": None if first is None else len(first.xyz),
+            "rings": None if first is None else len(np.unique(first.ring)),
+            "time_span": None if record.time_span is None else list(record.time_span),
         }
+        | (
+            {}
+            if not record.topics
+            else {
+                "topics": [f"{topic.name} ({topic.type})" for topic in record.topics],
+                "topic": record.topic,
+            }
+        )
+        | ({"poses": list(record.poses)} if record.topics or record.poses else {})
     )
 
 

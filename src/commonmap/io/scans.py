@@ -60,11 +60,16 @@ def iter_scans(folder: PathLike) -> Iterator[Scan]:
     """
     folder = Path(folder)
     stamps = scan_times(folder)
-    for index in range(len(stamps)):
+    check_complete(folder, len(stamps))
+    return (read_scan(folder, index, float(stamp)) for index, stamp in enumerate(stamps))
+
+
+def check_complete(folder: Path, n_scans: int) -> None:
+    """Raise where a file of one of the scans is not there."""
+    for index in range(n_scans):
         for part in _files(folder, index):
             if not part.is_file():
                 raise InputError(f"{folder}: {part.relative_to(folder)} is missing")
-    return (_read(folder, index, float(stamp)) for index, stamp in enumerate(stamps))
 
 
 def scan_times(folder: PathLike) -> NDArray[np.float64]:
@@ -92,8 +97,12 @@ def _files(folder: Path, index: int) -> tuple[Path, Path, Path]:
     )
 
 
-def _read(folder: Path, index: int, stamp: float) -> Scan:
+def read_scan(folder: Path, index: int, stamp: float) -> Scan:
+    """Return one scan of a folder. Points without finite coordinates are left out."""
     bin_path, time_path, ring_path = _files(folder, index)
+    for part in (bin_path, time_path, ring_path):
+        if not part.is_file():
+            raise InputError(f"{folder}: {part.relative_to(folder)} is missing")
     size = bin_path.stat().st_size
     if size % POINT_BYTES:
         raise InputError(

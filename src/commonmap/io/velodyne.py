@@ -225,7 +225,7 @@ class TurnReader:
         if model is None:
             raise InputError(
                 f"{self.path}: the packets do not say of which model they are (byte 0x{byte:02x}); "
-                f"give model, one of {', '.join(MODELS)}"
+                f"give model (--model), one of {', '.join(MODELS)}"
             )
         self.model = model
         try:

@@ -76,7 +76,7 @@ LAYOUTS: dict[str, Layout] = {
     ),
     "xyz": Layout(_XYZ, 16, None),
 }  # fmt: skip
-"""Layouts of velodyne_pointcloud 2, ouster_ros (PCL padding), hesai_ros_driver 2,
+"""Layouts of velodyne_pointcloud 2, ouster_ros (PCL padding), the first driver of Hesai (PCL),
 livox_ros_driver2, and points without anything."""
 
 

@@ -63,11 +63,12 @@ def _before(scan: Scan, sensor: Trajectory, border: Float64s) -> Scan:
 
 def write_logs(
     folder: Path, turns: Callable[[], Iterable[Scan]], sensor: Trajectory, lidar: LidarModel,
-    kinds: Collection[str],
+    kinds: Collection[str], *, seconds: float | None = None,
 ) -> None:  # fmt: skip
     """Write the same turns as raw logs of some kinds (names of `LOGS`) into a folder that exists.
 
-    turns: gives them from the first on, the same at each call. sensor: their true poses.
+    turns: gives them from the first on, the same at each call. sensor: their true poses; a bag
+    holds those of the first `seconds`, where given.
     """
     check_kinds(kinds)
     if "kitti" in kinds:
@@ -77,6 +78,9 @@ def write_logs(
         write_pcap(folder / "log.pcap", turns(), lidar=lidar)
     if "mcap" in kinds:
         poses = Trajectory(sensor.time[::5], sensor.T_map_sensor[::5])
+        if seconds is not None:
+            kept = poses.time <= poses.time[0] + seconds + 1.0 / lidar.rate
+            poses = Trajectory(poses.time[kept], poses.T_map_sensor[kept])
         write_mcap(folder / "log.mcap", turns(), poses=poses, n_channels=lidar.n_channels)
 
 

@@ -182,7 +182,7 @@ def _record_robot(
             progress=progress,
         )  # fmt: skip
 
-    write_logs(folder, turns, mission.sensor, lidar, logs)
+    write_logs(folder, turns, mission.sensor, lidar, logs, seconds=seconds)
 
 
 def _pick(scan: Scan, kept: np.ndarray[Any, np.dtype[np.bool_]]) -> Scan:

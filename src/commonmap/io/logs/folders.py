@@ -16,6 +16,7 @@ from commonmap.errors import InputError
 from commonmap.io import scans as own
 from commonmap.io.logs.derive import Seam, find_seam, rings_of, times_of
 from commonmap.io.logs.pointcloud2 import are_returns
+from commonmap.io.logs.poses import pose_files
 from commonmap.io.logs.record import Log, Options, Teller
 from commonmap.io.source import log, parsing
 from commonmap.types import Float64s, Progress, Scan, no_progress
@@ -56,17 +57,30 @@ def open_own(path: Path, _: Options) -> Log:
     times = own.scan_times(path)
     return Log(
         path=path, kind="KITTI folder (velodyne, time, ring)", n_scans=len(times),
-        time_span=(float(times[0]), float(times[-1])), poses=_pose_files(path),
+        time_span=(float(times[0]), float(times[-1])), poses=pose_files(path),
     )  # fmt: skip
 
 
 def iter_own(record: Log, options: Options, progress: Progress = no_progress) -> Iterator[Scan]:
     """Yield the scans of a folder of `write_scans`."""
     path = record.path
-    n = len(own.scan_times(path))
-    for i, scan in enumerate(own.iter_scans(path)):
-        progress(f"reading {path.name}", i / n)
+    stamps = own.scan_times(path)
+    if not options.keep_partial:
+        own.check_complete(path, len(stamps))
+    n = 0
+    for i, stamp in enumerate(stamps):
+        progress(f"reading {path.name}", i / len(stamps))
+        try:
+            scan = own.read_scan(path, i, float(stamp))
+        except InputError as error:
+            if not options.keep_partial:
+                raise
+            log.warning("%s; the scan is left out", error)
+            continue
+        n += 1
         yield scan
+    if not n:
+        raise InputError(f"{path}: none of its {len(stamps)} scans can be read")
 
 
 def open_folder(path: Path, _: Options) -> Log:
@@ -79,7 +93,7 @@ def open_folder(path: Path, _: Options) -> Log:
     return Log(
         path=path, kind=f"folder of {suffix}", n_scans=len(files),
         time_span=None if times is None else (float(times[0]), float(times[-1])),
-        poses=_pose_files(path),
+        poses=pose_files(path),
     )  # fmt: skip
 
 
@@ -150,13 +164,6 @@ def _look_deskewed(files: list[Path], teller: Teller) -> bool:
     return True
 
 
-def _pose_files(path: Path) -> tuple[str, ...]:
-    names = ("poses.txt", "trajectory.tum", "truth.tum", "poses.tum")
-    places = [path, path.parent] if path.name in ("velodyne", "data") else [path]
-    return tuple(str(place / name) for place in places for name in names
-                 if (place / name).is_file())  # fmt: skip
-
-
 def _times(path: Path, files: list[Path]) -> Float64s | None:
     """Return the stamps (M,) of the files, seconds, None where there are none."""
     places = [files[0].parent / "times.txt", files[0].parent.parent / "times.txt"]
@@ -218,8 +225,8 @@ def _read(file: Path, stamp: float, period: float, options: Options, teller: Tel
         time = np.full(len(xyz), stamp)
     else:
         teller.tell(
-            "its points have no time: it is told from their azimuth (say deskewed if they were "
-            "moved to one moment)"
+            "its points have no time: it is told from their azimuth (say deskewed, --deskewed, if "
+            "they were moved to one moment)"
         )
         time = times_of(xyz, ring, stamp, period)
     return Scan(

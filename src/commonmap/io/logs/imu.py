@@ -31,24 +31,28 @@ class Acceleration:
     felt: Float64s
 
 
-def read_acceleration(path: PathLike, *, sensor: str | None = None) -> Acceleration | None:
+def read_acceleration(
+    path: PathLike, *, sensor: str | None = None, topic: str | None = None,
+    keep_partial: bool = False,
+) -> Acceleration | None:  # fmt: skip
     """Return what the IMU of a bag felt; None where there is none that can be used.
 
-    sensor: frame of the lidar, else that of the bag's scans. The way from the IMU's axes to the
-    lidar's is taken from /tf_static; one of another frame that nothing joins is left out, with a
-    warning. Of several, the first that is joined is taken.
+    sensor: frame of the lidar, else that of the bag's scans (topic: of those that are read). The
+    way from the IMU's axes to the lidar's is taken from /tf_static; one of another frame that
+    nothing joins is left out, with a warning. Of several, the first that is joined is taken.
+    keep_partial: of a bag that is truncated or damaged, take what can be read.
     """
     path = Path(path)
     if not is_bag_folder(path) and path.suffix.lower() not in (".bag", ".mcap", ".db3"):
         return None
-    record = open_rosbag(path, Options())
-    topics = [topic for topic in record.topics if topic.type == IMU and topic.count != 0]
+    record = open_rosbag(path, Options(topic, keep_partial=keep_partial))
+    topics = [found for found in record.topics if found.type == IMU and found.count != 0]
     if not topics:
         return None
-    sensor = sensor or frame_of_scans(path, record.topics, record.topic)
-    edges = edges_of(path, record.topics, only_static=True)
-    for topic in topics:
-        time, felt, frame = _read(path, topic.name)
+    sensor = sensor or frame_of_scans(path, record.topics, record.topic, keep_partial=keep_partial)
+    edges = edges_of(path, record.topics, only_static=True, keep_partial=keep_partial)
+    for found in topics:
+        time, felt, frame = _read(path, found.name, keep_partial)
         if len(time) < 2:
             continue
         R = np.eye(3)
@@ -57,7 +61,7 @@ def read_acceleration(path: PathLike, *, sensor: str | None = None) -> Accelerat
             if T_sensor_imu is None:
                 log.warning(
                     "%s: the IMU of %s is not used: no /tf_static joins %s and %s",
-                    path, shown(topic.name), shown(frame), shown(sensor),
+                    path, shown(found.name), shown(frame), shown(sensor),
                 )  # fmt: skip
                 continue
             R = T_sensor_imu[:3, :3]
@@ -66,12 +70,12 @@ def read_acceleration(path: PathLike, *, sensor: str | None = None) -> Accelerat
     return None
 
 
-def _read(path: Path, topic: str) -> tuple[Float64s, Float64s, str]:
+def _read(path: Path, topic: str, keep_partial: bool) -> tuple[Float64s, Float64s, str]:
     """Return times (M,), rising, accelerations (M, 3) that are finite, and their frame."""
     times: list[float] = []
     felt: list[tuple[float, float, float]] = []
     frame = ""
-    for message in iter_messages(path, [topic]):
+    for message in iter_messages(path, [topic], keep_partial=keep_partial):
         with parsing(path, f"Imu of {shown(topic)}"):
             decoded = decode(message)
             a = decoded.linear_acceleration

@@ -82,7 +82,8 @@ def iter_datagrams(path: PathLike, *, keep_partial: bool = False) -> Iterator[Da
         except _Damaged as fault:
             if not keep_partial:
                 raise InputError(
-                    f"{path} {fault}; what comes before can be read with keep_partial"
+                    f"{path} {fault}; what comes before can be read with keep_partial "
+                    "(--keep-partial)"
                 ) from None
             log.warning("%s %s; what comes before is kept", path, fault)
 

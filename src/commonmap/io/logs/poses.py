@@ -32,27 +32,41 @@ from commonmap.io.source import PathLike, is_text, log, look, looks_like, parsin
 from commonmap.io.trajectory import read_trajectory
 from commonmap.types import Float64s, Trajectory
 
+POSE_FILES = ("poses.txt", "trajectory.tum", "truth.tum", "poses.tum")
+"""Names of files with poses in a folder of scans, or in the one around it."""
+
 Edges = dict[str, tuple[str, list[float], list[Float64s], bool]]
 """Child frame -> parent frame, times, T_parent_child, whether it never moves."""
 
 
 def read_poses(
     path: PathLike, *, topic: str | None = None, times: Float64s | None = None,
-    sensor: str | None = None, fixed: str | None = None,
+    sensor: str | None = None, fixed: str | None = None, beside: PathLike | None = None,
+    keep_partial: bool = False,
 ) -> Trajectory:  # fmt: skip
-    """Return the poses of the lidar that a file or a bag holds.
+    """Return the poses of the lidar that a file, a folder of scans or a bag holds.
 
-    path: a TUM file (8 numbers a line), a KITTI poses file (12 a line), or a bag.
+    path: a TUM file (8 numbers a line), a KITTI poses file (12 a line), a folder with one of these,
+        or a bag.
     topic: of a bag, where it has several with poses; `/tf` follows the frames from `fixed` to
         `sensor`.
     times: (M,) seconds of the poses of a KITTI file, which has none; its `times.txt` if None. Where
         a `calib.txt` with `Tr` lies beside it, poses of the camera become poses of the lidar.
     sensor: frame of the lidar; None takes that of the bag's scans. fixed: frame of the map; None
-        takes the one that has no parent.
+        takes the one that has no parent. beside: the folder of the log, whose `times.txt` and
+        `calib.txt` are taken where none lie beside a KITTI file.
+    keep_partial: of a bag that is truncated or damaged, what can be read.
     """
     path = Path(path)
+    if path.is_dir() and not is_bag_folder(path):
+        files = pose_files(path)
+        if len(files) != 1:
+            raise InputError(
+                f"{path} should hold one file of poses ({', '.join(POSE_FILES)}); {len(files)} came"
+            )
+        path, beside = Path(files[0]), path
     if is_bag_folder(path) or path.suffix.lower() in (".bag", ".mcap", ".db3"):
-        return _from_bag(path, topic, sensor, fixed)
+        return _from_bag(path, topic, sensor, fixed, keep_partial)
     if topic is not None:
         raise InputError(f"{path} is no bag: it has no topic {topic!r}")
     path, _, head = look(path)
@@ -61,16 +75,27 @@ def read_poses(
     rows = (row.strip() for row in head.decode("utf-8", "replace").splitlines())
     first = next((row for row in rows if row and not row.startswith("#")), "")
     if len(first.replace(",", " ").split()) == 12:
-        return read_kitti_poses(path, times=times)
+        return read_kitti_poses(path, times=times, beside=beside)
     return read_trajectory(path)
 
 
-def read_kitti_poses(path: PathLike, *, times: Float64s | None = None) -> Trajectory:
+def pose_files(path: Path) -> tuple[str, ...]:
+    """Return the files with poses that belong to a folder of scans."""
+    places = [path, path.parent] if path.name in ("velodyne", "data") else [path]
+    found = (place / name for place in places for name in POSE_FILES)
+    return tuple(str(file) for file in found if file.is_file())
+
+
+def read_kitti_poses(
+    path: PathLike, *, times: Float64s | None = None, beside: PathLike | None = None
+) -> Trajectory:
     """Return the poses of a KITTI file: the upper 3 rows of T_first_now, row by row.
 
     times: (M,) seconds; None takes `times.txt` beside the file. Where `calib.txt` beside it has
     `Tr` (T_camera_lidar), the poses are those of the left camera and are turned into the lidar's.
+    beside: a folder where these two are looked for as well (KITTI keeps all poses in one place).
     """
+    places = [Path(path).parent, *([] if beside is None else [Path(beside)])]
     path, _, _ = look(path)
     with parsing(path, "KITTI poses"):
         rows = [line.split() for line in path.read_text("ascii").splitlines() if line.strip()]
@@ -82,15 +107,15 @@ def read_kitti_poses(path: PathLike, *, times: Float64s | None = None) -> Trajec
     for i in (0, len(T) - 1):
         check_T(T[i], f"pose {i} of {path}")
     if times is None:
-        beside = path.parent / "times.txt"
-        if not beside.is_file():
+        listed = next((p / "times.txt" for p in places if (p / "times.txt").is_file()), None)
+        if listed is None:
             raise InputError(f"{path} has no times, and there is no times.txt beside it")
-        with parsing(beside, "a list of times"):
-            times = np.array(beside.read_text("ascii").split(), dtype=np.float64)
+        with parsing(listed, "a list of times"):
+            times = np.array(listed.read_text("ascii").split(), dtype=np.float64)
     if len(times) != len(T) or not (np.diff(times) > 0).all() or not np.isfinite(times).all():
         raise InputError(f"{path} holds {len(T)} poses; {len(times)} rising times are expected")
-    calibration = path.parent / "calib.txt"
-    if calibration.is_file():
+    calibration = next((p / "calib.txt" for p in places if (p / "calib.txt").is_file()), None)
+    if calibration is not None:
         T_camera_lidar = _read_calibration(calibration)
         if T_camera_lidar is not None:
             T = invert(T_camera_lidar) @ T @ T_camera_lidar
@@ -109,17 +134,19 @@ def _read_calibration(path: Path) -> Float64s | None:
     return None
 
 
-def _from_bag(path: Path, topic: str | None, sensor: str | None, fixed: str | None) -> Trajectory:
-    record = open_rosbag(path, Options())
+def _from_bag(
+    path: Path, topic: str | None, sensor: str | None, fixed: str | None, keep_partial: bool
+) -> Trajectory:
+    record = open_rosbag(path, Options(keep_partial=keep_partial))
     chosen = _choose(path, [t for t in record.topics if t.holds == "poses"], topic)
     if sensor is None:
-        sensor = frame_of_scans(path, record.topics, record.topic)
+        sensor = frame_of_scans(path, record.topics, record.topic, keep_partial=keep_partial)
     if chosen.type in TF:
-        return _from_tf(path, record.topics, sensor, fixed)
+        return _from_tf(path, record.topics, sensor, fixed, keep_partial)
     times: list[float] = []
     motions: list[Float64s] = []
     child = ""
-    for message in iter_messages(path, [chosen.name]):
+    for message in iter_messages(path, [chosen.name], keep_partial=keep_partial):
         with parsing(path, f"{shown(chosen.type)} of {shown(chosen.name)}"):
             child, time, T = _pose_of(message)
         if not times or time > times[-1]:
@@ -129,7 +156,7 @@ def _from_bag(path: Path, topic: str | None, sensor: str | None, fixed: str | No
         raise InputError(f"{path}: topic {shown(chosen.name)} holds no poses")
     T_map_child = np.array(motions)
     if child and sensor and child != sensor:
-        edges = edges_of(path, record.topics, only_static=True)
+        edges = edges_of(path, record.topics, only_static=True, keep_partial=keep_partial)
         T_child_sensor = still_motion(edges, child, sensor)
         if T_child_sensor is None:
             log.warning(
@@ -154,13 +181,16 @@ def _choose(path: Path, topics: list[Topic], wanted: str | None) -> Topic:
     moving = [topic for topic in topics if topic.type in TF and "static" not in topic.name]
     if not direct and len(moving) == 1:
         return moving[0]
-    raise InputError(f"{path}: give the topic with the poses; it has {names}")
+    raise InputError(f"{path}: give the topic with the poses (--poses TOPIC); it has {names}")
 
 
-def frame_of_scans(path: Path, topics: Iterable[Topic], chosen: str | None) -> str | None:
+def frame_of_scans(
+    path: Path, topics: Iterable[Topic], chosen: str | None, *, keep_partial: bool = False
+) -> str | None:
+    """Return the frame of the first scan of a bag, of one topic or of any."""
     for topic in topics:
         if topic.holds == "scans" and chosen in (None, topic.name):
-            for message in iter_messages(path, [topic.name]):
+            for message in iter_messages(path, [topic.name], keep_partial=keep_partial):
                 with parsing(path, f"{shown(topic.type)} of {shown(topic.name)}"):
                     if topic.type in LIVOX:
                         return read_custom(message.data, is_ros1=message.is_ros1).frame
@@ -199,11 +229,13 @@ def _time(header: Any) -> float:
     return float(header.stamp.sec) + float(header.stamp.nanosec) * 1e-9
 
 
-def edges_of(path: Path, topics: Iterable[Topic], *, only_static: bool = False) -> Edges:
+def edges_of(
+    path: Path, topics: Iterable[Topic], *, only_static: bool = False, keep_partial: bool = False
+) -> Edges:
     """Return the frames of /tf and /tf_static."""
     names = [t.name for t in topics if t.type in TF and (not only_static or "static" in t.name)]
     edges: Edges = {}
-    for message in iter_messages(path, names) if names else ():
+    for message in iter_messages(path, names, keep_partial=keep_partial) if names else ():
         with parsing(path, f"TFMessage of {shown(message.topic)}"):
             transforms = decode(message).transforms
             for item in transforms:
@@ -247,9 +279,9 @@ def still_motion(edges: Edges, a: str, b: str) -> Float64s | None:
 
 
 def _from_tf(
-    path: Path, topics: Iterable[Topic], sensor: str | None, fixed: str | None
+    path: Path, topics: Iterable[Topic], sensor: str | None, fixed: str | None, keep_partial: bool
 ) -> Trajectory:
-    edges = edges_of(path, topics)
+    edges = edges_of(path, topics, keep_partial=keep_partial)
     if sensor is None or sensor.lstrip("/") not in edges:
         raise InputError(
             f"{path}: /tf does not tell where {shown(str(sensor))} is; it has "

@@ -95,7 +95,9 @@ def require_topic(path: Path, topics: Sequence[Topic], wanted: str | None) -> To
         return topic
     with_scans = [topic for topic in topics if topic.holds == "scans" and topic.count != 0]
     if with_scans:
-        raise InputError(f"{path} has several topics with scans, give topic: {_list(with_scans)}")
+        raise InputError(
+            f"{path} has several topics with scans, give topic (--topic): {_list(with_scans)}"
+        )
     raise InputError(f"{path} has no topic with scans; {_list(topics)}")
 
 
@@ -109,7 +111,9 @@ def _list(topics: Sequence[Topic]) -> str:
     if not topics:
         return "it has none with scans"
     listed = ", ".join(
-        f"{shown(topic.name)} ({shown(topic.type)}, {topic.count})" for topic in topics[:12]
+        f"{shown(topic.name)} ({shown(topic.type)}"
+        + (")" if topic.count is None else f", {topic.count})")
+        for topic in topics[:12]
     )
     more = f", and {len(topics) - 12} more" if len(topics) > 12 else ""
     return f"it has {listed}{more}"

@@ -110,7 +110,7 @@ def open_bag(path: Path) -> Iterator[Any]:
         except Exception as error:
             raise InputError(
                 f"{path} cannot be opened as {kind} ({reason(error)}): it is truncated or damaged; "
-                "keep_partial reads what is there"
+                "keep_partial (--keep-partial) reads what is there"
             ) from error
         yield reader
 
