@@ -1,0 +1,102 @@
+"""OctoMap's own command line tools on scans that both sides insert, and on files that we wrote.
+
+The tools are Debian's package octomap-tools. What they print and write is compared as it is.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from commonmap.io.octomap import read_scan_graph, write_octree
+from commonmap.mapping.octree import Octree
+from octree_oracles import room_scan
+
+TOOLS = ("log2graph", "graph2tree", "compare_octrees", "convert_octree", "eval_octree_accuracy")
+pytestmark = pytest.mark.skipif(
+    not all(map(shutil.which, TOOLS)), reason="octomap-tools are not installed"
+)
+
+RESOLUTION = 0.2
+EVERY = 5
+"""Of the scans, the one of these that `eval_octree_accuracy` keeps for the test."""
+
+
+def run(*command: object) -> str:
+    done = subprocess.run([str(c) for c in command], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return done.stdout + done.stderr
+
+
+@pytest.fixture(scope="module")
+def graph(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a scan graph of six scans in a room, made by OctoMap from a text log.
+
+    The sensor moves and does not turn: how OctoMap rounds a rotation is its own.
+    """
+    folder = tmp_path_factory.mktemp("graph")
+    rng = np.random.default_rng(9)
+    lines = []
+    for k in range(6):
+        origin = np.array([0.4 * k, -0.2 * k, 1.5])
+        lines.append(f"NODE {origin[0]} {origin[1]} {origin[2]} 0 0 0")
+        lines += ["{:.6f} {:.6f} {:.6f}".format(*p) for p in (room_scan(origin, rng) - origin)[::3]]
+    (folder / "room.log").write_text("\n".join(lines) + "\n")
+    run("log2graph", folder / "room.log", folder / "room.graph")
+    return folder / "room.graph"
+
+
+def tree_of(graph: Path, numbers: Iterable[int], **how: Any) -> Octree:
+    """Return our tree of some scans of a graph."""
+    tree = Octree(RESOLUTION)
+    scans = read_scan_graph(graph)
+    for number in numbers:
+        t = scans[number].T_map_sensor[:3, 3].astype(np.float32)
+        tree.insert(t, scans[number].xyz + t, **how)
+    return tree
+
+
+@pytest.mark.parametrize(
+    ("options", "how"),
+    [
+        ((), {}),
+        (("-m", "6"), {"max_range": 6.0}),
+        (("-discretize",), {"discretize": True}),
+    ],
+)
+def test_graph2tree_and_we_make_the_same_files(
+    graph: Path, tmp_path: Path, options: tuple[str, ...], how: dict[str, Any]
+) -> None:
+    peer = tmp_path / "peer.bt"
+    run("graph2tree", "-i", graph, "-o", peer, "-res", RESOLUTION, *options)
+    tree = tree_of(graph, range(6), **how)
+    write_octree(tmp_path / "ours.ot", tree.leaf_parts())
+    write_octree(tmp_path / "ours.bt", tree.leaf_parts())
+    assert (tmp_path / "ours.bt").read_bytes() == peer.read_bytes()
+    assert (tmp_path / "ours.ot").read_bytes() == (tmp_path / "peer.bt.ot").read_bytes()
+    told = run("compare_octrees", tmp_path / "ours.ot", tmp_path / "peer.bt.ot")
+    assert re.search(r"KLD: 0$", told, re.MULTILINE)
+    run("convert_octree", tmp_path / "ours.ot", tmp_path / "again.bt")
+    assert (tmp_path / "again.bt").read_bytes() == peer.read_bytes()
+
+
+def test_eval_octree_accuracy_counts_what_we_count(graph: Path) -> None:
+    told = run("eval_octree_accuracy", graph, "-res", RESOLUTION)
+    found = re.search(r"correct: (\d+)\s+#wrong: (\d+)\s+#unknown: (\d+)", told)
+    assert found is not None, told
+    tested = EVERY - 1
+    tree = tree_of(graph, [n for n in range(6) if n != tested])
+    seen = tree_of(graph, [tested]).leaves(pruned=False)  # what that scan calls free and occupied
+    known = tree.log_odds_at(seen.centres())
+    unknown = np.isnan(known)
+    right = ~unknown & ((known >= 0) == seen.occupied)
+    counts = int(right.sum()), int((~right & ~unknown).sum()), int(unknown.sum())
+    assert counts[0] > 3000 and counts[1] > 0 and counts[2] > 0
+    assert tuple(map(int, found.groups())) == counts
