@@ -19,7 +19,7 @@ from commonmap.odometry.geometry import (
     find_lack,
 )
 from commonmap.odometry.local_map import LocalMap, thin
-from commonmap.odometry.map_match import match_planes
+from commonmap.odometry.map_match import match_map
 from commonmap.odometry.motion import (
     T_to_motion,
     damp_rate,
@@ -348,6 +348,12 @@ def test_the_map_agrees_with_a_dictionary(seed: int, per_voxel: int) -> None:
     before = local.all_points()
     local.insert(before[:500].astype(np.float64))
     assert np.array_equal(local.all_points(), before)  # all of them are there already
+    for v in range(0, local.n, 97):  # the sums that planes are fitted from are of these points
+        x = local.points[v, : local.count[v]].astype(np.float64)
+        x -= (np.floor(x[0] / 0.5) + 0.5) * 0.5
+        products = [x[:, a] * x[:, b] for a, b in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
+        expected = np.array([*x.T, *products]).sum(axis=1)
+        assert local.sums[v] == pytest.approx(expected, abs=1e-9)
 
 
 def test_memory_of_the_map_is_bounded_on_a_long_way() -> None:
@@ -432,9 +438,9 @@ def test_one_ring_with_noisy_ranges_is_no_plane() -> None:
     fine, coarse = (LocalMap(v, per_voxel=50, reach=50.0) for v in (0.3, 0.9))
     fine.insert(ring)
     coarse.insert(ring)
-    assert len(match_planes(ring[::10].copy(), np.eye(4), fine, coarse)) == 0
+    assert len(match_map(ring[::10].copy(), 20, np.eye(4), fine, coarse, coarse)) == 0
     for z in (-0.25, -0.15, 0.15, 0.25):
         fine.insert(ring + np.array([0.0, 0.0, z]))
-    rows = match_planes(ring[40:160:10].copy(), np.eye(4), fine, coarse)
+    rows = match_map(ring[40:160:10].copy(), 12, np.eye(4), fine, coarse, coarse)
     assert len(rows) == 12
     assert np.abs(rows.u[:, 0]).min() > 0.95

@@ -12,23 +12,29 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from commonmap.frames import invert
 from commonmap.odometry.features import Features, pick_features
 from commonmap.odometry.local_map import LocalMap, thin
-from commonmap.odometry.map_match import match_lines, match_planes
-from commonmap.odometry.motion import T_to_motion, damp_rate, deskew, motion_to_T, sweep_motion
-from commonmap.odometry.records import ScanHealth
-from commonmap.odometry.scan_match import (
-    RingedPoints,
-    by_ring,
-    match_scan_lines,
-    match_scan_planes,
+from commonmap.odometry.map_match import match_map
+from commonmap.odometry.motion import (
+    damp_rate,
+    deskew,
+    motion_between,
+    motion_to_T,
+    place,
+    sweep_motion,
 )
-from commonmap.odometry.solve import Openness, Rows, bisquare, find_openness, minimise, residuals
-from commonmap.odometry.turn import Turn, arrange
+from commonmap.odometry.records import ScanHealth
+from commonmap.odometry.scan_match import RingedPoints, by_ring, match_scan
+from commonmap.odometry.solve import Openness, Rows, residuals, settle
+from commonmap.odometry.turn import Turn, arrange, select
 from commonmap.types import Float64s, Scan
 
 STILL = np.zeros(6)
+STAY = np.eye(4)
+
+WHOLE = 10
+"""The first turns enter the map whole, of later ones every other planar point: most would fall into
+voxels that are full."""
 
 LEAST_MATCHED = 30
 LEAST_SHARE = 0.15
@@ -144,19 +150,16 @@ class Loam:
     def _take(self, turn: Turn) -> Taken:
         """Pick the features of a turn."""
         features: Features = pick_features(turn)
-        ring = np.repeat(np.arange(turn.n_rings), np.diff(turn.ring_start))
-        xyz = turn.xyz
-        smooth = features.smooth
-        smooth = smooth[thin(xyz[smooth].astype(np.float64), self.fine.apart)]
+        smooth = features.smooth[thin(turn.xyz[features.smooth], self.fine.apart)]
         parts: list[NDArray[np.float64] | NDArray[np.int64]] = []
         for chosen in (features.sharp, features.flat, features.less_sharp, smooth):
-            parts += [xyz[chosen].astype(np.float64), turn.delay[chosen], ring[chosen]]
+            parts += select(turn.xyz, turn.delay, turn.ring, chosen)
         return Taken(turn, *parts)  # type: ignore[arg-type]
 
     def _motion_of(self, T_map_turn: Float64s, dt: float) -> Float64s:
         """Return the motion per second (6,) that led from the last pose to this one."""
-        T_turn_last = invert(T_map_turn) @ self.poses[-2 if len(self.poses) > 1 else -1]
-        rate, _ = sweep_motion(T_to_motion(T_turn_last), dt)
+        last = self.poses[-2 if len(self.poses) > 1 else -1]
+        rate, _ = sweep_motion(motion_between(T_map_turn, last), dt)
         return rate
 
     def _unskew(
@@ -169,28 +172,26 @@ class Loam:
     def _match_last(self, taken: Taken, dt: float) -> Float64s:
         """Return T_last_turn from the features of this turn and the last (section V of LOAM)."""
         assert self._last is not None
-        first = len(self.poses) == 1
-        rate = self._rate
-        rounds = 8 if first else self.options.scan_rounds
+        o, first, rate = self.options, len(self.poses) == 1, self._rate
+        rounds = 8 if first else o.scan_rounds
+        points = np.concatenate([taken.sharp, taken.flat])
+        delay = np.concatenate([taken.sharp_delay, taken.flat_delay])
+        ring = np.concatenate([taken.sharp_ring, taken.flat_ring])
         T = motion_to_T(rate * dt)
         before: tuple[RingedPoints, RingedPoints] | None = None
         for _ in range(rounds):
             # the first two turns are deskewed together, by the motion between them
             if before is None or first:
                 before = self._ringed(self._last, rate if first else self._deskew_rate_last)
-            sharp = self._unskew(taken.sharp, taken.sharp_delay, rate, STILL)
-            flat = self._unskew(taken.flat, taken.flat_delay, rate, STILL)
+            here = self._unskew(points, delay, rate, STILL)
             reach = 1.0 if first else max(2.0 * self.voxel, 0.5)
-            rows = join(
-                match_scan_lines(sharp, taken.sharp_ring, T, before[0], reach),
-                match_scan_planes(flat, taken.flat_ring, T, before[1], reach),
-            )
+            rows = match_scan(here, ring, len(taken.sharp), T, *before, reach)
             if len(rows) < 20:
                 break
-            T_new, _, _ = self._solve(T, rows, None)
+            T_new, _, _ = settle(T, rows, None, lever=self.lever, tolerance=o.tolerance)
             step = self._moved(T, T_new)
             T = T_new
-            new_rate, _ = sweep_motion(T_to_motion(invert(T)), dt)
+            new_rate, _ = sweep_motion(motion_between(T, STAY), dt)
             rate = damp_rate(new_rate, None if first else self._rate)
             if step < 0.05 * self.voxel:
                 break
@@ -216,32 +217,30 @@ class Loam:
         chosen = thin(taken.smooth, self._cell)
         growth = np.sqrt(max(len(chosen), 1) / o.n_planar)
         self._cell = float(np.clip(self._cell * growth, 0.5 * self.voxel, 6.0 * self.voxel))
-        points, delay = taken.smooth[chosen], taken.smooth_delay[chosen]
-        T_guess = T
-        rows, w = join(), np.zeros(0)
+        points = np.concatenate([taken.smooth[chosen], taken.edge])
+        delay = np.concatenate([taken.smooth_delay[chosen], taken.edge_delay])
+        T_guess, w = T, np.zeros(0)
         open_: Openness | None = None
-        looked = len(points) + len(taken.edge)
-        planes = lines = rows
+        rows = Rows.room(0)
         asked: Float64s | None = None  # the pose at which the map was asked for partners
         for _ in range(o.map_rounds):
-            rate, _ = sweep_motion(T_to_motion(invert(T) @ self.poses[-1]), dt)
-            planar = self._unskew(points, delay, rate, STILL)
-            edge = self._unskew(taken.edge, taken.edge_delay, rate, STILL)
+            rate, _ = sweep_motion(motion_between(T, self.poses[-1]), dt)
+            here = self._unskew(points, delay, rate, STILL)
             if asked is None or self._moved(asked, T) > 0.2 * self.voxel:
-                planes = match_planes(planar, T, self.fine, self.coarse)
-                lines = match_lines(edge, T, self.edges)
+                rows = match_map(here, len(chosen), T, self.fine, self.coarse, self.edges)
                 asked, open_ = T, None
-            rows = join(planes.refresh(planar), lines.refresh(edge))
+            else:
+                rows = rows.refresh(here)
             if len(rows) < LEAST_MATCHED:
                 break
-            T_new, open_, w = self._solve(T, rows, open_)
+            T_new, open_, w = settle(T, rows, open_, lever=self.lever, tolerance=o.tolerance)
             step = self._moved(T, T_new)
             T = T_new
             if step < 0.01 * self.voxel:
                 break
-        self._deskew_rate_last = sweep_motion(T_to_motion(invert(T) @ self.poses[-1]), dt)[0]
+        self._deskew_rate_last = sweep_motion(motion_between(T, self.poses[-1]), dt)[0]
         n_matched = int((w > 0).sum())
-        share = min(n_matched / max(looked, 1), 1.0)
+        share = min(n_matched / max(len(points), 1), 1.0)
         # a map of two or three turns is thin: that few features find a plane there is no trouble
         usual = max(LEAST_SHARE, FALL * self._share) if len(self.poses) >= 5 else 0.0
         lost = n_matched < LEAST_MATCHED or share < usual
@@ -259,23 +258,8 @@ class Loam:
 
     def _moved(self, T: Float64s, T_new: Float64s) -> float:
         """Return how far the scene moves between two poses, metres: shift and turn together."""
-        step = T_to_motion(invert(T) @ T_new)
+        step = motion_between(T, T_new)
         return float(np.linalg.norm(step[:3]) + self.lever * np.linalg.norm(step[3:]))
-
-    def _solve(
-        self, T: Float64s, rows: Rows, open_: Openness | None
-    ) -> tuple[Float64s, Openness, Float64s]:
-        """Return the pose after a few steps of Levenberg-Marquardt with robust weights.
-
-        open_: what the same rows leave open, where it was found before.
-        """
-        R, t = np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy()
-        robust, spread = bisquare(residuals(R, t, rows.p, rows.c, rows.u) / rows.sigma)
-        w = robust / (spread * rows.sigma) ** 2
-        if open_ is None:
-            tolerance = self.options.tolerance
-            open_ = find_openness(R, rows, w, lever=self.lever, tolerance=tolerance)
-        return minimise(T, rows, w, open_, iterations=2), open_, w
 
     # ------------------------------------------------------------ the map
 
@@ -285,15 +269,17 @@ class Loam:
             return
         assert self._last is not None
         T, dt0 = self.poses[-2], self.moments[-2] - self.moments[-3]
-        before = T_to_motion(invert(T) @ self.poses[-3])
-        after, dt1 = T_to_motion(invert(T) @ self.poses[-1]), self.moments[-1] - self.moments[-2]
+        before = motion_between(T, self.poses[-3])
+        after, dt1 = motion_between(T, self.poses[-1]), self.moments[-1] - self.moments[-2]
         rate, bend = sweep_motion(before, dt0, after, dt1)
         self._insert(self._last, T, rate, bend)
 
     def _insert(self, taken: Taken, T: Float64s, rate: Float64s, bend: Float64s) -> None:
-        R, t = T[:3, :3].T, T[:3, 3]
-        smooth = self._unskew(taken.smooth, taken.smooth_delay, rate, bend) @ R + t
-        edge = self._unskew(taken.edge, taken.edge_delay, rate, bend) @ R + t
+        some = slice(len(self.poses) % 2, None, 2) if len(self.poses) > WHOLE else slice(None)
+        smooth, delay = taken.smooth[some], taken.smooth_delay[some]
+        smooth = place(T, self._unskew(smooth, delay, rate, bend))
+        edge = place(T, self._unskew(taken.edge, taken.edge_delay, rate, bend))
+        t = T[:3, 3]
         self.fine.insert(smooth)
         self.coarse.insert(smooth)
         self.edges.insert(edge)
@@ -301,18 +287,3 @@ class Loam:
             for part in (self.fine, self.coarse, self.edges):
                 part.crop(np.ascontiguousarray(t))
             self._cropped = t.copy()
-
-
-def join(*parts: Rows) -> Rows:
-    """Return the rows of all parts, one after the other."""
-    if not parts:
-        none = np.zeros((0, 3))
-        return Rows(none, none, none, np.zeros(0), np.zeros(0), np.zeros(0, np.int64))
-    return Rows(
-        np.concatenate([part.p for part in parts]),
-        np.concatenate([part.c for part in parts]),
-        np.concatenate([part.u for part in parts]),
-        np.concatenate([part.sigma for part in parts]),
-        np.concatenate([part.tilt for part in parts]),
-        np.concatenate([part.feature for part in parts]),
-    )

@@ -18,32 +18,35 @@ WIDTH = 0.28
 deviation (a disc of one voxel's radius: 0.5)."""
 
 
-def match_planes(points: Float64s, T: Float64s, fine: LocalMap, coarse: LocalMap) -> Rows:
-    """Return one row (Eq. 3) for each planar point (N, 3) that finds a plane in the map.
+def match_map(
+    points: Float64s, n_planar: int, T: Float64s, fine: LocalMap, coarse: LocalMap, edges: LocalMap
+) -> Rows:
+    """Return the rows of planar points and, behind them, of edge points that find their like.
 
-    The plane is that of the map's points within one voxel's edge (principal axes); where these lie
-    on a line, as the rings of one turn do far away, the coarse map is asked.
+    points: (N, 3), the first `n_planar` of them planar.
+
+    - One row (Eq. 3) for each planar point that finds a plane: that of the map's points in the
+      voxels around whose middle lies within one edge (principal axes); where these lie on a line,
+      as the rings of one turn do far away, the coarse map is asked.
+    - Two rows (Eq. 2) for each edge point that finds a line.
     """
-    out = _planes(
-        points, T[:3, :3].copy(), T[:3, 3].copy(), fine.voxel, fine.keys, fine.count, fine.points,
-        fine.table, coarse.voxel, coarse.keys, coarse.count, coarse.points, coarse.table,
+    rows = Rows.room(2 * len(points) - n_planar)
+    R, t = np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy()
+    end = _planes(
+        points[:n_planar], R, t, fine.voxel, fine.keys, fine.count, fine.sums, fine.table,
+        coarse.voxel, coarse.keys, coarse.count, coarse.sums, coarse.table, *rows.arrays,
     )  # fmt: skip
-    return Rows(*out)
-
-
-def match_lines(points: Float64s, T: Float64s, edges: LocalMap) -> Rows:
-    """Return two rows (Eq. 2) for each edge point (N, 3) that finds a line in the map."""
-    out = _lines(
-        points, T[:3, :3].copy(), T[:3, 3].copy(), edges.voxel, edges.keys, edges.count,
-        edges.points, edges.table,
+    end = _lines(
+        points, n_planar, end, R, t, edges.voxel, edges.keys, edges.count, edges.sums, edges.table,
+        *rows.arrays,
     )  # fmt: skip
-    return Rows(*out)
+    return rows.head(end)
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _gather(x, y, z, edge, keys, count, kept, table, mean, S):  # type: ignore[no-untyped-def]
-    """Fill mean (3,) and covariance S (3, 3) of the map's points within one edge of a point;
-    return their number."""
+def _gather(x, y, z, edge, keys, count, sums, table, mean, S):  # type: ignore[no-untyped-def]
+    """Fill mean (3,) and covariance S (3, 3) of the points of the voxels around (x, y, z) whose
+    middle lies within one edge of it; return their number."""
     n = 0
     sx = sy = sz = 0.0
     xx = yy = zz = xy = xz = yz = 0.0
@@ -51,32 +54,35 @@ def _gather(x, y, z, edge, keys, count, kept, table, mean, S):  # type: ignore[n
     i0, j0, k0 = np.int64(np.floor(x / edge)), np.int64(np.floor(y / edge)), np.int64(
         np.floor(z / edge)
     )  # fmt: skip
+    half = 0.5 * edge
     for i in range(i0 - 1, i0 + 2):
-        bx = max(0.0, max(i * edge - x, x - (i + 1) * edge))
+        bx = (i + 0.5) * edge - x
+        gx = max(0.0, abs(bx) - half)
         for j in range(j0 - 1, j0 + 2):
-            by = max(0.0, max(j * edge - y, y - (j + 1) * edge))
+            by = (j + 0.5) * edge - y
+            gy = max(0.0, abs(by) - half)
             for k in range(k0 - 1, k0 + 2):
-                bz = max(0.0, max(k * edge - z, z - (k + 1) * edge))
-                if bx * bx + by * by + bz * bz >= r2:
+                bz = (k + 0.5) * edge - z
+                gz = max(0.0, abs(bz) - half)
+                if gx * gx + gy * gy + gz * gz > r2:  # all of the voxel lies farther
                     continue
                 voxel, _ = find(pack(i, j, k), keys, table)
                 if voxel < 0:
                     continue
-                for q in range(count[voxel]):
-                    dx = kept[voxel, q, 0] - x
-                    dy = kept[voxel, q, 1] - y
-                    dz = kept[voxel, q, 2] - z
-                    if dx * dx + dy * dy + dz * dz < r2:
-                        n += 1
-                        sx += dx
-                        sy += dy
-                        sz += dz
-                        xx += dx * dx
-                        yy += dy * dy
-                        zz += dz * dz
-                        xy += dx * dy
-                        xz += dx * dz
-                        yz += dy * dz
+                m = count[voxel]
+                ax, ay, az = sums[voxel, 0], sums[voxel, 1], sums[voxel, 2]
+                if (ax / m + bx) ** 2 + (ay / m + by) ** 2 + (az / m + bz) ** 2 > r2:
+                    continue
+                n += m
+                sx += ax + m * bx
+                sy += ay + m * by
+                sz += az + m * bz
+                xx += sums[voxel, 3] + bx * (2.0 * ax + m * bx)
+                yy += sums[voxel, 4] + by * (2.0 * ay + m * by)
+                zz += sums[voxel, 5] + bz * (2.0 * az + m * bz)
+                xy += sums[voxel, 6] + bx * ay + by * ax + m * bx * by
+                xz += sums[voxel, 7] + bx * az + bz * ax + m * bx * bz
+                yz += sums[voxel, 8] + by * az + bz * ay + m * by * bz
     if n > 0:
         sx, sy, sz = sx / n, sy / n, sz / n
         S[0, 0], S[1, 1], S[2, 2] = xx / n - sx * sx, yy / n - sy * sy, zz / n - sz * sz
@@ -89,12 +95,11 @@ def _gather(x, y, z, edge, keys, count, kept, table, mean, S):  # type: ignore[n
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _planes(  # type: ignore[no-untyped-def]
-    points, R, t, edge, keys, count, kept, table, edge2, keys2, count2, kept2, table2
-):
-    """Return p, c, u, sigma, tilt, feature of the rows of planar points."""
+    points, R, t, edge, keys, count, sums, table, edge2, keys2, count2, sums2, table2, p, c, u,
+    sigma, tilt, feature,
+):  # fmt: skip
+    """Fill the rows of planar points from the first on; return their number."""
     n = points.shape[0]
-    p, c, u = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
-    sigma, tilt, feature = np.empty(n), np.empty(n), np.empty(n, np.int64)
     S, V, lam, mean = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
     rows = 0
     for i in range(n):
@@ -104,9 +109,9 @@ def _planes(  # type: ignore[no-untyped-def]
         found = False
         for level in range(2):
             if level == 0:
-                m = _gather(x, y, z, edge, keys, count, kept, table, mean, S)
+                m = _gather(x, y, z, edge, keys, count, sums, table, mean, S)
             else:
-                m = _gather(x, y, z, edge2, keys2, count2, kept2, table2, mean, S)
+                m = _gather(x, y, z, edge2, keys2, count2, sums2, table2, mean, S)
             if m < 6:
                 continue
             eigen3(S, lam, V)
@@ -133,22 +138,20 @@ def _planes(  # type: ignore[no-untyped-def]
         tilt[rows] = own / m * (0.5 / lam[1] + 0.5 / lam[2])
         feature[rows] = i
         rows += 1
-    return p[:rows], c[:rows], u[:rows], sigma[:rows], tilt[:rows], feature[:rows]
+    return rows
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _lines(points, R, t, edge, keys, count, kept, table):  # type: ignore[no-untyped-def]
-    """Return p, c, u, sigma, tilt, feature of the rows of edge points, two rows a line."""
-    n = points.shape[0]
-    p, c, u = np.empty((2 * n, 3)), np.empty((2 * n, 3)), np.empty((2 * n, 3))
-    sigma, tilt, feature = np.empty(2 * n), np.empty(2 * n), np.empty(2 * n, np.int64)
+def _lines(  # type: ignore[no-untyped-def]
+    points, first, rows, R, t, edge, keys, count, sums, table, p, c, u, sigma, tilt, feature
+):
+    """Fill the rows of edge points from `first` on, two a line, behind `rows`; return the end."""
     S, V, lam, mean = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
-    rows = 0
-    for i in range(n):
+    for i in range(first, points.shape[0]):
         x = R[0, 0] * points[i, 0] + R[0, 1] * points[i, 1] + R[0, 2] * points[i, 2] + t[0]
         y = R[1, 0] * points[i, 0] + R[1, 1] * points[i, 1] + R[1, 2] * points[i, 2] + t[1]
         z = R[2, 0] * points[i, 0] + R[2, 1] * points[i, 1] + R[2, 2] * points[i, 2] + t[2]
-        m = _gather(x, y, z, edge, keys, count, kept, table, mean, S)
+        m = _gather(x, y, z, edge, keys, count, sums, table, mean, S)
         if m < 5:
             continue
         eigen3(S, lam, V)
@@ -167,4 +170,4 @@ def _lines(points, R, t, edge, keys, count, kept, table):  # type: ignore[no-unt
             tilt[rows] = own / m / lam[2]
             feature[rows] = i
         rows += 1
-    return p[:rows], c[:rows], u[:rows], sigma[:rows], tilt[:rows], feature[:rows]
+    return rows

@@ -18,10 +18,11 @@ def rotate(theta: Float64s, R: Float64s) -> None:
     """Fill R (3, 3) with the rotation of a rotation vector (Rodrigues; Zhang and Singh, Eq. 6)."""
     x, y, z = theta[0], theta[1], theta[2]
     square = x * x + y * y + z * z
-    angle = np.sqrt(square)
-    if angle < 1e-4:
-        a, b = 1.0 - square / 6.0, 0.5 - square / 24.0
+    if square < 0.04:  # a turn's motion: the series is exact to 1e-10 and needs no trigonometry
+        a = 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0))
+        b = 0.5 - square / 24.0 * (1.0 - square / 30.0 * (1.0 - square / 56.0))
     else:
+        angle = np.sqrt(square)
         a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / square
     R[0, 0], R[0, 1], R[0, 2] = 1 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y
     R[1, 0], R[1, 1], R[1, 2] = b * x * y + a * z, 1 - b * (x * x + z * z), b * y * z - a * x
@@ -67,6 +68,21 @@ def T_to_motion(T: Float64s) -> Float64s:
     return np.concatenate([T[:3, 3], rotation_vector(T)])
 
 
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def motion_between(T_a: Float64s, T_b: Float64s) -> Float64s:
+    """Return `[t, theta]` (6,) of T_a^-1 T_b: the pose b seen from the pose a."""
+    motion = np.empty(6)
+    R = np.zeros((3, 3))
+    for r in range(3):
+        motion[r] = 0.0
+        for k in range(3):
+            motion[r] += T_a[k, r] * (T_b[k, 3] - T_a[k, 3])
+            for c in range(3):
+                R[r, c] += T_a[k, r] * T_b[k, c]
+    motion[3:] = rotation_vector(R)
+    return motion
+
+
 def interpolate_motion(motion: Float64s, share: float) -> Float64s:
     """Return the motion (6,) a share of the way: `T_i = share * T` (Eq. 4)."""
     return share * np.asarray(motion, dtype=np.float64)
@@ -99,6 +115,15 @@ def deskew(points: Float64s, delay: Float64s, rate: Float64s, bend: Float64s) ->
         rotate(motion[3:], R)
         p[0], p[1], p[2] = points[i, 0], points[i, 1], points[i, 2]
         move_point(R, motion[:3], p, out[i])
+    return out
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def place(T: Float64s, points: Float64s) -> Float64s:
+    """Return points (N, 3) moved by T (4, 4)."""
+    out = np.empty((points.shape[0], 3))
+    for i in range(points.shape[0]):
+        move_point(T[:3, :3], T[:3, 3], points[i], out[i])
     return out
 
 

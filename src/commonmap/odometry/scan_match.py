@@ -39,52 +39,61 @@ def by_ring(xyz: Float64s, ring: NDArray[np.int64], n_rings: int) -> RingedPoint
     return RingedPoints(np.ascontiguousarray(xyz[order]), azimuth[order], start)
 
 
-def match_scan_lines(
-    points: Float64s, ring: NDArray[np.int64], T: Float64s, before: RingedPoints, reach: float
-) -> Rows:
-    """Return two rows (Eq. 2) for each edge point that finds a line j, l in the turn before.
+def match_scan(
+    points: Float64s, ring: NDArray[np.int64], n_sharp: int, T: Float64s, edges: RingedPoints,
+    planes: RingedPoints, reach: float,
+) -> Rows:  # fmt: skip
+    """Return the rows of edge points and, behind them, of planar points that find partners.
 
-    T: (4, 4) takes the points (N, 3) into the frame of `before`. reach: metres.
+    T: (4, 4) takes the points (N, 3), the first `n_sharp` of them edges, into the frame of the turn
+    before. Two rows (Eq. 2) for each edge point that finds a line j, l there; one (Eq. 3) for each
+    planar point that finds a plane j, l, m. reach: metres.
     """
-    out = _scan_lines(
-        points, ring, T[:3, :3].copy(), T[:3, 3].copy(), before.xyz, before.azimuth, before.start,
-        reach,
+    rows = Rows.room(len(points) + n_sharp)
+    R, t = np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy()
+    end = _scan_lines(
+        points[:n_sharp], ring, R, t, edges.xyz, edges.azimuth, edges.start, reach, *rows.arrays
+    )
+    end = _scan_planes(
+        points, n_sharp, end, ring, R, t, planes.xyz, planes.azimuth, planes.start, reach,
+        *rows.arrays,
     )  # fmt: skip
-    return Rows(*out)
-
-
-def match_scan_planes(
-    points: Float64s, ring: NDArray[np.int64], T: Float64s, before: RingedPoints, reach: float
-) -> Rows:
-    """Return one row (Eq. 3) for each planar point that finds a plane j, l, m."""
-    out = _scan_planes(
-        points, ring, T[:3, :3].copy(), T[:3, 3].copy(), before.xyz, before.azimuth, before.start,
-        reach,
-    )  # fmt: skip
-    return Rows(*out)
+    return rows.head(end)
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _nearest(x, azimuth_x, first, last, xyz, azimuth, reach, j, least):  # type: ignore[no-untyped-def]
-    """Return (index, squared distance) of the point of one ring nearest to x, within reach.
+def _nearest(x, azimuth_x, first, last, xyz, azimuth, best, j, least):  # type: ignore[no-untyped-def]
+    """Return (index, squared distance) of the point of one ring nearest to x, nearer than
+    `sqrt(best)`; (-1, best) where there is none.
 
     j: a point from which it must be at least `sqrt(least)` metres away, or -1.
     """
-    n = last - first
-    best, at = reach * reach, -1
+    n, at = last - first, -1
     if n == 0:
         return at, best
-    flat = np.sqrt(x[0] * x[0] + x[1] * x[1])
-    window = np.pi if flat <= reach else np.arcsin(reach / flat)
-    begin = np.searchsorted(azimuth[first:last], azimuth_x)
+    flat2 = x[0] * x[0] + x[1] * x[1]
+    begin, high = first, last
+    while begin < high:
+        middle = (begin + high) // 2
+        if azimuth[middle] < azimuth_x:
+            begin = middle + 1
+        else:
+            high = middle
+    begin -= first
     for direction in (1, -1):
         for k in range(n):
             i = begin + k if direction == 1 else begin - 1 - k
-            i = first + i % n
+            if i >= n:
+                i -= n
+            elif i < 0:
+                i += n
+            i += first
             turn = abs(azimuth[i] - azimuth_x)
             turn = min(turn, 2.0 * np.pi - turn)
-            # what lies farther round than the best so far cannot be nearer
-            if turn > window or (turn < 1.5 and (flat * np.sin(turn)) ** 2 > best):
+            # what lies farther round than the best so far cannot be nearer: its distance is at
+            # least that of x to its bearing, flat * sin(turn)
+            sine = turn * (1.0 - turn * turn / 6.0) if turn < 1.5 else 0.9
+            if flat2 * sine * sine > best:
                 break
             d = (xyz[i, 0] - x[0]) ** 2 + (xyz[i, 1] - x[1]) ** 2 + (xyz[i, 2] - x[2]) ** 2
             if d < best:
@@ -98,35 +107,41 @@ def _nearest(x, azimuth_x, first, last, xyz, azimuth, reach, j, least):  # type:
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _scan_lines(points, ring, R, t, xyz, azimuth, start, reach):  # type: ignore[no-untyped-def]
-    n, n_rings = points.shape[0], start.shape[0] - 1
-    p, c, u = np.empty((2 * n, 3)), np.empty((2 * n, 3)), np.empty((2 * n, 3))
-    feature = np.empty(2 * n, np.int64)
+def _nearest_around(x, azimuth_x, ring, skip, start, xyz, azimuth, best):  # type: ignore[no-untyped-def]
+    """Return (index, its ring) of the point nearest to x on the rings around one, that ring first;
+    (-1, -1) where none is nearer than `sqrt(best)`. skip: leave out the ring itself."""
+    at = on = -1
+    for step in range(1 if skip else 0, 2 * NEAR_RINGS + 1):
+        k = ring + (step + 1) // 2 * (1 if step % 2 else -1)
+        if 0 <= k < start.shape[0] - 1:
+            i, d = _nearest(x, azimuth_x, start[k], start[k + 1], xyz, azimuth, best, -1, 0.0)
+            if i >= 0:
+                at, best, on = i, d, k
+    return at, on
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _scan_lines(  # type: ignore[no-untyped-def]
+    points, ring, R, t, xyz, azimuth, start, reach, p, c, u, sigma, tilt, feature
+):
+    """Fill the rows of edge points from the first on, two a line; return their number."""
+    n = points.shape[0]
     x, e = np.empty(3), np.empty(3)
     rows = 0
     for i in range(n):
         for r in range(3):
             x[r] = R[r, 0] * points[i, 0] + R[r, 1] * points[i, 1] + R[r, 2] * points[i, 2] + t[r]
         a = np.arctan2(x[1], x[0])
-        j, best, on = -1, reach * reach, -1
-        for k in range(max(0, ring[i] - NEAR_RINGS), min(n_rings, ring[i] + NEAR_RINGS + 1)):
-            at, d = _nearest(x, a, start[k], start[k + 1], xyz, azimuth, reach, -1, 0.0)
-            if at >= 0 and d < best:
-                j, best, on = at, d, k
+        j, on = _nearest_around(x, a, ring[i], False, start, xyz, azimuth, reach * reach)
         if j < 0:
             continue
-        l, best = -1, 4.0 * reach * reach
-        for k in range(max(0, on - NEAR_RINGS), min(n_rings, on + NEAR_RINGS + 1)):
-            if k == on:
-                continue
-            at, d = _nearest(x, a, start[k], start[k + 1], xyz, azimuth, 2.0 * reach, -1, 0.0)
-            if at >= 0 and d < best:
-                l, best = at, d
+        l, _ = _nearest_around(x, a, on, True, start, xyz, azimuth, 4.0 * reach * reach)
         if l < 0 or point_to_line(x, xyz[j], xyz[l]) > reach:
             continue
         for r in range(3):
             e[r] = xyz[l, r] - xyz[j, r]
-        e /= max(np.sqrt((e * e).sum()), 1e-9)
+        length = max(np.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2]), 1e-9)
+        e[0], e[1], e[2] = e[0] / length, e[1] / length, e[2] / length
         k = 0
         for r in range(1, 3):
             if abs(e[r]) < abs(e[k]):
@@ -150,41 +165,33 @@ def _scan_lines(points, ring, R, t, xyz, azimuth, start, reach):  # type: ignore
                 u[rows, 0] = e[1] * a3 - e[2] * a2
                 u[rows, 1] = e[2] * a1 - e[0] * a3
                 u[rows, 2] = e[0] * a2 - e[1] * a1
-            feature[rows] = i
+            sigma[rows], tilt[rows], feature[rows] = 0.1, 0.0, i
             rows += 1
-    return p[:rows], c[:rows], u[:rows], np.full(rows, 0.1), np.zeros(rows), feature[:rows]
+    return rows
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _scan_planes(points, ring, R, t, xyz, azimuth, start, reach):  # type: ignore[no-untyped-def]
-    n, n_rings = points.shape[0], start.shape[0] - 1
-    p, c, u = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
-    sigma, tilt, feature = np.empty(n), np.empty(n), np.empty(n, np.int64)
+def _scan_planes(  # type: ignore[no-untyped-def]
+    points, first, rows, ring, R, t, xyz, azimuth, start, reach, p, c, u, sigma, tilt, feature
+):
+    """Fill the rows of planar points from `first` on behind `rows`; return the end."""
     x, normal = np.empty(3), np.empty(3)
-    rows = 0
-    for i in range(n):
+    for i in range(first, points.shape[0]):
         for r in range(3):
             x[r] = R[r, 0] * points[i, 0] + R[r, 1] * points[i, 1] + R[r, 2] * points[i, 2] + t[r]
         a = np.arctan2(x[1], x[0])
-        j, best, on = -1, reach * reach, -1
-        for k in range(max(0, ring[i] - NEAR_RINGS), min(n_rings, ring[i] + NEAR_RINGS + 1)):
-            at, d = _nearest(x, a, start[k], start[k + 1], xyz, azimuth, reach, -1, 0.0)
-            if at >= 0 and d < best:
-                j, best, on = at, d, k
+        j, on = _nearest_around(x, a, ring[i], False, start, xyz, azimuth, reach * reach)
         if j < 0:
             continue
-        m, best = -1, 4.0 * reach * reach
-        for k in range(max(0, on - NEAR_RINGS), min(n_rings, on + NEAR_RINGS + 1)):
-            if k == on:
-                continue
-            at, d = _nearest(x, a, start[k], start[k + 1], xyz, azimuth, 2.0 * reach, -1, 0.0)
-            if at >= 0 and d < best:
-                m, best = at, d
+        m, _ = _nearest_around(x, a, on, True, start, xyz, azimuth, 4.0 * reach * reach)
         if m < 0:
             continue
-        gap2 = ((xyz[j] - xyz[m]) ** 2).sum()
+        gap2 = 0.0
+        for r in range(3):
+            gap2 += (xyz[j, r] - xyz[m, r]) ** 2
+        far = 4.0 * reach * reach
         # as far from j as m is, or nearly: a triangle that noise cannot turn
-        l, _ = _nearest(x, a, start[on], start[on + 1], xyz, azimuth, 2.0 * reach, j, 0.25 * gap2)
+        l, _ = _nearest(x, a, start[on], start[on + 1], xyz, azimuth, far, j, 0.25 * gap2)
         if l < 0:
             continue
         d = point_to_plane(x, xyz[j], xyz[l], xyz[m], normal)
@@ -194,8 +201,7 @@ def _scan_planes(points, ring, R, t, xyz, azimuth, start, reach):  # type: ignor
             p[rows, r] = points[i, r]
             c[rows, r] = xyz[j, r]
             u[rows, r] = normal[r]
-        sigma[rows] = 0.05
-        tilt[rows] = 2.0 * 0.02**2 / max(gap2, 1e-4)
+        sigma[rows], tilt[rows] = 0.05, 2.0 * 0.02**2 / max(gap2, 1e-4)
         feature[rows] = i
         rows += 1
-    return p[:rows], c[:rows], u[:rows], sigma[:rows], tilt[:rows], feature[:rows]
+    return rows

@@ -8,13 +8,14 @@ edge two, with normals across the line: the sum of their squares is the square o
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from commonmap.odometry.motion import motion_to_T
-from commonmap.types import Bools, Float64s
+from commonmap.odometry.motion import rotate
+from commonmap.types import Float64s
 
 PRETENDED = 1.25
 """A direction with less information than so many times what noise pretends is degenerate."""
@@ -38,6 +39,23 @@ class Rows:
 
     def __len__(self) -> int:
         return len(self.p)
+
+    @staticmethod
+    def room(n: int) -> Rows:
+        """Return n rows that are to be filled."""
+        p, c, u = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
+        return Rows(p, c, u, np.empty(n), np.empty(n), np.empty(n, np.int64))
+
+    @property
+    def arrays(self) -> tuple[NDArray[Any], ...]:
+        """p, c, u, sigma, tilt and feature, for kernels."""
+        return self.p, self.c, self.u, self.sigma, self.tilt, self.feature
+
+    def head(self, n: int) -> Rows:
+        """Return the first n rows."""
+        return Rows(
+            self.p[:n], self.c[:n], self.u[:n], self.sigma[:n], self.tilt[:n], self.feature[:n]
+        )
 
     def refresh(self, points: Float64s) -> Rows:
         """Return the same rows for the features' points as they are now, (M, 3)."""
@@ -114,43 +132,84 @@ def pretended(R: Float64s, p: Float64s, u: Float64s, w: Float64s, tilt: Float64s
     `tilt A (I - u u^T) A^T` with A = [I; [p]x]: on a flat field this is all there is of x, y, yaw.
     """
     H = np.zeros((6, 6))
-    v = np.empty(3)
     row = np.empty(6)
+    n = x = y = z = xx = yy = zz = xy = xz = yz = 0.0
     for i in range(p.shape[0]):
         s = w[i] * tilt[i]
         if s <= 0.0:
             continue
+        # A A^T: the three axes
+        a, b, c = p[i, 0], p[i, 1], p[i, 2]
+        n += s
+        x, y, z = x + s * a, y + s * b, z + s * c
+        xx, yy, zz = xx + s * a * a, yy + s * b * b, zz + s * c * c
+        xy, xz, yz = xy + s * a * b, xz + s * a * c, yz + s * b * c
+        # less that along the normal itself
         for r in range(3):
-            v[r] = R[0, r] * u[i, 0] + R[1, r] * u[i, 1] + R[2, r] * u[i, 2]
-        for axis in range(4):  # the three axes, less the normal itself
-            for r in range(3):
-                row[r] = v[r] if axis == 3 else (1.0 if r == axis else 0.0)
-            row[3] = p[i, 1] * row[2] - p[i, 2] * row[1]
-            row[4] = p[i, 2] * row[0] - p[i, 0] * row[2]
-            row[5] = p[i, 0] * row[1] - p[i, 1] * row[0]
-            sign = -s if axis == 3 else s
-            for a in range(6):
-                for b in range(6):
-                    H[a, b] += sign * row[a] * row[b]
+            row[r] = R[0, r] * u[i, 0] + R[1, r] * u[i, 1] + R[2, r] * u[i, 2]
+        row[3], row[4] = b * row[2] - c * row[1], c * row[0] - a * row[2]
+        row[5] = a * row[1] - b * row[0]
+        for j in range(6):
+            for k in range(j + 1):
+                H[j, k] -= s * row[j] * row[k]
+    H[0, 0], H[1, 1], H[2, 2] = H[0, 0] + n, H[1, 1] + n, H[2, 2] + n
+    H[3, 1], H[3, 2] = H[3, 1] - z, H[3, 2] + y
+    H[4, 0], H[4, 2] = H[4, 0] + z, H[4, 2] - x
+    H[5, 0], H[5, 1] = H[5, 0] - y, H[5, 1] + x
+    H[3, 3], H[4, 4], H[5, 5] = H[3, 3] + yy + zz, H[4, 4] + xx + zz, H[5, 5] + xx + yy
+    H[4, 3], H[5, 3], H[5, 4] = H[4, 3] - xy, H[5, 3] - xz, H[5, 4] - yz
+    for j in range(6):
+        for k in range(j):
+            H[k, j] = H[j, k]
     return H
 
 
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def bisquare(whitened: Float64s) -> tuple[Float64s, float]:
     """Return robust weights (N,) of residuals in units of their sigma, and their robust spread.
 
     Tukey's bisquare, as Zhang and Singh 2014 use it; the spread comes from the median.
     """
-    spread = 1.4826 * float(np.median(np.abs(whitened))) if len(whitened) else 1.0
+    spread = 1.4826 * np.median(np.abs(whitened)) if len(whitened) else 1.0
     spread = max(spread, 0.2)
-    ratio = whitened / (BISQUARE * spread)
-    return np.where(np.abs(ratio) < 1.0, (1.0 - ratio * ratio) ** 2, 0.0), spread
+    weight = np.empty(len(whitened))
+    for i in range(len(whitened)):
+        ratio = whitened[i] / (BISQUARE * spread)
+        weight[i] = (1.0 - ratio * ratio) ** 2 if abs(ratio) < 1.0 else 0.0
+    return weight, spread
 
 
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def levenberg_marquardt_step(H: Float64s, g: Float64s, damping: float) -> Float64s:
-    """Return the step of Eq. 8, (6,): `-(J^T J + lambda diag(J^T J))^-1 J^T d`."""
-    ridge = 1e-12 * max(float(np.trace(H)), 1e-12)
-    A = H + np.diag(damping * np.diag(H) + ridge)
-    return np.asarray(-np.linalg.solve(A, g), dtype=np.float64)
+    """Return the step of Eq. 8, (6,): `-(J^T J + lambda diag(J^T J))^-1 J^T d`.
+
+    By Cholesky's decomposition, since J^T J is symmetric and positive.
+    """
+    ridge = 1e-12 * max(np.trace(H), 1e-12)
+    L = np.zeros((6, 6))
+    step = np.empty(6)
+    for i in range(6):
+        for j in range(i + 1):
+            s = H[i, j]
+            if i == j:
+                s += damping * H[i, i] + ridge
+            for k in range(j):
+                s -= L[i, k] * L[j, k]
+            if i == j:
+                L[i, i] = np.sqrt(max(s, 0.5 * ridge))
+            else:
+                L[i, j] = s / L[j, j]
+    for i in range(6):
+        s = -g[i]
+        for k in range(i):
+            s -= L[i, k] * step[k]
+        step[i] = s / L[i, i]
+    for i in range(5, -1, -1):
+        s = step[i]
+        for k in range(i + 1, 6):
+            s -= L[k, i] * step[k]
+        step[i] = s / L[i, i]
+    return step
 
 
 def find_openness(
@@ -164,37 +223,93 @@ def find_openness(
     """
     H, _, _ = normal_equations(R, np.zeros(3), rows.p, rows.c, rows.u, w)
     noise = pretended(R, rows.p, rows.u, w, rows.tilt)
-    S = np.diag([1.0, 1.0, 1.0, 1 / lever, 1 / lever, 1 / lever])
-    values, V = np.linalg.eigh(S @ H @ S)
-    floor = np.einsum("ik,ij,jk->k", V, S @ noise @ S, V)
-    closed: Bools = (values > PRETENDED * floor) & (values > 1.0 / tolerance**2)
+    return Openness(*_openness(H, noise, lever, tolerance), lever)
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _openness(
+    H: Float64s, noise: Float64s, lever: float, tolerance: float
+) -> tuple[Float64s, Float64s]:
+    """Return P (6, 6) and the open directions (K, 6) of `Openness`."""
+    scale = np.array([1.0, 1.0, 1.0, 1.0 / lever, 1.0 / lever, 1.0 / lever])
+    scales = scale.reshape(6, 1) * scale
+    values, V = np.linalg.eigh(scales * H)
+    noise = scales * noise
+    kept, open_ = np.zeros((6, 6)), np.empty((6, 6))
+    n = 0
+    for k in range(6):
+        v = V[:, k].copy()
+        if values[k] > PRETENDED * (v @ (noise @ v)) and values[k] > 1.0 / tolerance**2:
+            kept += v.reshape(6, 1) * v
+        else:
+            open_[n] = v
+            n += 1
     # V_u V^-1 of the paper: a step's parts along open directions are left out
-    kept = V[:, closed]
-    P = S @ kept @ kept.T @ np.linalg.inv(S)
-    return Openness(P, V[:, ~closed].T.copy(), lever)
+    return scale.reshape(6, 1) * kept / scale, open_[:n].copy()
 
 
 def minimise(
     T: Float64s, rows: Rows, w: Float64s, openness: Openness | None, *, iterations: int
 ) -> Float64s:
     """Return the pose (4, 4) after Levenberg-Marquardt from `T` with fixed rows and weights."""
-    damping = 1e-4
+    P = np.eye(6) if openness is None else openness.P
     H, g, cost = normal_equations(_R(T), T[:3, 3].copy(), rows.p, rows.c, rows.u, w)
+    moved: Float64s = _minimise(T, rows.p, rows.c, rows.u, w, P, H, g, cost, iterations)
+    return moved
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _minimise(
+    T: Float64s, p: Float64s, c: Float64s, u: Float64s, w: Float64s, P: Float64s, H: Float64s,
+    g: Float64s, cost: float, iterations: int,
+) -> Float64s:  # fmt: skip
+    """Return the pose after some steps; H, g, cost: the normal equations at T."""
+    damping = 1e-4
+    best = T.copy()
+    R, t, turn = T[:3, :3].copy(), T[:3, 3].copy(), np.empty((3, 3))
     for _ in range(iterations):
-        step = levenberg_marquardt_step(H, g, damping)
-        if openness is not None:
-            step = openness.P @ step
-        trial = T @ motion_to_T(step)
-        H_new, g_new, cost_new = normal_equations(
-            _R(trial), trial[:3, 3].copy(), rows.p, rows.c, rows.u, w
-        )
+        step = P @ levenberg_marquardt_step(H, g, damping)
+        rotate(step[3:], turn)
+        R_new, t_new = R @ turn, R @ step[:3] + t
+        H_new, g_new, cost_new = normal_equations(R_new, t_new, p, c, u, w)
         if cost_new <= cost:
-            T, H, g, cost, damping = trial, H_new, g_new, cost_new, damping / 10
+            R, t, H, g, cost = R_new, t_new, H_new, g_new, cost_new
+            damping /= 10.0
             if np.abs(step[:3]).max() < 1e-4 and np.abs(step[3:]).max() < 1e-5:
                 break
         else:
-            damping = max(damping, 1e-6) * 100
-    return T
+            damping = max(damping, 1e-6) * 100.0
+    best[:3, :3], best[:3, 3] = R, t
+    return best
+
+
+def settle(
+    T: Float64s, rows: Rows, open_: Openness | None, *, lever: float, tolerance: float
+) -> tuple[Float64s, Openness, Float64s]:
+    """Return the pose after a few steps with robust weights, what is open, and the weights (N,).
+
+    open_: what the same rows leave open, where it was found before.
+    """
+    P, directions = (np.zeros((0, 6)),) * 2 if open_ is None else (open_.P, open_.directions)
+    T_new, P, directions, w = _settle(
+        T, rows.p, rows.c, rows.u, rows.sigma, rows.tilt, P, directions, lever, tolerance
+    )
+    return T_new, Openness(P, directions, lever), w
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _settle(
+    T: Float64s, p: Float64s, c: Float64s, u: Float64s, sigma: Float64s, tilt: Float64s,
+    P: Float64s, directions: Float64s, lever: float, tolerance: float,
+) -> tuple[Float64s, Float64s, Float64s, Float64s]:  # fmt: skip
+    """Return T, P, directions and w of `settle`; an empty P is found anew."""
+    R, t = T[:3, :3].copy(), T[:3, 3].copy()
+    w, spread = bisquare(residuals(R, t, p, c, u) / sigma)
+    w /= (spread * sigma) ** 2
+    H, g, cost = normal_equations(R, t, p, c, u, w)
+    if len(P) == 0:
+        P, directions = _openness(H, pretended(R, p, u, w, tilt), lever, tolerance)
+    return _minimise(T, p, c, u, w, P, H, g, cost, 2), P, directions, w
 
 
 def _R(T: Float64s) -> Float64s:

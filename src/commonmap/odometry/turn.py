@@ -19,7 +19,7 @@ class Turn:
     """Returns of one turn, sorted by ring and, within a ring, by time.
 
     xyz: (N, 3) float32, sensor frame of each point's moment. range, azimuth: (N,) float32.
-    delay: (N,) float64 seconds from `moment` to the point's time.
+    delay: (N,) float64 seconds from `moment` to the point's time. ring: (N,).
     ring_start: (R + 1,) first point of each ring. source: (N,) the point's index in the scan.
     moment: seconds, the mean time of the points: the moment the turn's pose is for.
     spacing: radians between neighbours on a ring, the median.
@@ -29,6 +29,7 @@ class Turn:
     range: Float32s
     azimuth: Float32s
     delay: Float64s
+    ring: NDArray[np.int64]
     ring_start: NDArray[np.int64]
     source: NDArray[np.int64]
     moment: float
@@ -46,71 +47,84 @@ def arrange(scan: Scan) -> Turn:
     time, ring = np.asarray(scan.time, np.float64), np.asarray(scan.ring, np.int64)
     xyz = np.ascontiguousarray(scan.xyz, np.float32)
     n_rings = int(ring.max()) + 1 if len(ring) else 0
-    order = _order(ring, xyz, MIN_RANGE * MIN_RANGE, n_rings)
-    if not _is_sorted(ring, time, order):
+    order, is_sorted = _order(ring, time, xyz, MIN_RANGE * MIN_RANGE, n_rings)
+    if not is_sorted:
         order = order[np.lexsort((time[order], ring[order]))]
-    order = order[_first_returns(ring, time, order)]
-    start = np.zeros(n_rings + 1, np.int64)
-    np.cumsum(np.bincount(ring[order], minlength=n_rings), out=start[1:])
-    moment = float(time[order].mean()) if len(order) else float(scan.stamp)
-    xyz = xyz[order]
-    range_, azimuth = _polar(xyz)
+    out = _collect(ring, time, xyz, order, n_rings)
+    points, range_, azimuth, delay, ring, ring_start, source, moment = out
     return Turn(
-        xyz=xyz, range=range_, azimuth=azimuth, delay=time[order] - moment, ring_start=start,
-        source=order, moment=moment, spacing=_spacing(azimuth, start),
+        points, range_, azimuth, delay, ring, ring_start, source,
+        moment if len(order) else float(scan.stamp), _spacing(azimuth, ring_start),
     )  # fmt: skip
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _order(
-    ring: NDArray[np.int64], xyz: Float32s, nearest: float, n_rings: int
-) -> NDArray[np.int64]:
-    """Return the indices of usable points by ring, else in the order they came (counting sort)."""
+    ring: NDArray[np.int64], time: Float64s, xyz: Float32s, nearest: float, n_rings: int
+) -> tuple[NDArray[np.int64], bool]:
+    """Return the indices of usable points by ring, else in the order they came (counting sort),
+    and whether they are by time on each ring."""
     count = np.zeros(n_rings + 1, np.int64)
     usable = np.zeros(len(ring), np.bool_)
+    last = np.full(n_rings + 1, -np.inf)
+    is_sorted = True
     for i in range(len(ring)):
         square = xyz[i, 0] * xyz[i, 0] + xyz[i, 1] * xyz[i, 1] + xyz[i, 2] * xyz[i, 2]
         if square >= nearest and square < 1e8:  # NaN and infinity fail
             usable[i] = True
             count[ring[i] + 1] += 1
+            is_sorted = is_sorted and time[i] >= last[ring[i]]
+            last[ring[i]] = time[i]
     at = np.cumsum(count)
     order = np.empty(at[-1], np.int64)
     for i in range(len(ring)):
         if usable[i]:
             order[at[ring[i]]] = i
             at[ring[i]] += 1
-    return order
+    return order, is_sorted
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _is_sorted(ring: NDArray[np.int64], time: Float64s, order: NDArray[np.int64]) -> bool:
-    for k in range(1, len(order)):
-        a, b = order[k - 1], order[k]
-        if ring[a] == ring[b] and time[b] < time[a]:
-            return False
-    return True
-
-
-@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _first_returns(
-    ring: NDArray[np.int64], time: Float64s, order: NDArray[np.int64]
-) -> NDArray[np.bool_]:
-    kept = np.ones(len(order), np.bool_)
-    for k in range(1, len(order)):
-        a, b = order[k - 1], order[k]
-        kept[k] = ring[a] != ring[b] or time[a] != time[b]
-    return kept
-
-
-@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _polar(xyz: Float32s) -> tuple[Float32s, Float32s]:
-    n = xyz.shape[0]
-    range_, azimuth = np.empty(n, np.float32), np.empty(n, np.float32)
-    for i in range(n):
+def _collect(  # type: ignore[no-untyped-def]
+    ring, time, xyz, order, n_rings
+):
+    """Return xyz, range, azimuth, delay, ring, ring_start, source and moment of a turn."""
+    n = 0
+    kept = np.empty(len(order), np.int64)
+    start = np.zeros(n_rings + 1, np.int64)
+    moment = 0.0
+    for k in range(len(order)):
+        i = order[k]
+        if k > 0 and ring[i] == ring[order[k - 1]] and time[i] == time[order[k - 1]]:
+            continue
+        kept[n] = i
+        n += 1
+        start[ring[i] + 1] += 1
+        moment += time[i] - time[order[0]]
+    moment = moment / max(n, 1) + (time[order[0]] if n else 0.0)
+    points, range_ = np.empty((n, 3), np.float32), np.empty(n, np.float32)
+    azimuth, delay, on = np.empty(n, np.float32), np.empty(n), np.empty(n, np.int64)
+    for k in range(n):
+        i = kept[k]
         x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
-        range_[i] = np.sqrt(x * x + y * y + z * z)
-        azimuth[i] = np.arctan2(y, x)
-    return range_, azimuth
+        points[k, 0], points[k, 1], points[k, 2] = x, y, z
+        range_[k], azimuth[k] = np.sqrt(x * x + y * y + z * z), np.arctan2(y, x)
+        delay[k], on[k] = time[i] - moment, ring[i]
+    return points, range_, azimuth, delay, on, np.cumsum(start), kept[:n], moment
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def select(
+    xyz: Float32s, delay: Float64s, ring: NDArray[np.int64], chosen: NDArray[np.int64]
+) -> tuple[Float64s, Float64s, NDArray[np.int64]]:
+    """Return xyz as float64, delay and ring of some points."""
+    n = len(chosen)
+    points, delays, rings = np.empty((n, 3)), np.empty(n), np.empty(n, np.int64)
+    for k in range(n):
+        i = chosen[k]
+        points[k, 0], points[k, 1], points[k, 2] = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+        delays[k], rings[k] = delay[i], ring[i]
+    return points, delays, rings
 
 
 def _spacing(azimuth: Float32s, start: NDArray[np.int64]) -> float:
