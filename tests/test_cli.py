@@ -387,6 +387,18 @@ def test_disk_full_is_one_sentence_and_leaves_nothing(
     told(run("run", folder / "base.ply", folder / "draft.ply", "-o", out, "-q"), "no space left")
     told(run("match", folder / "base.ply", folder / "draft.ply", "-o", out, "-q"), "no space left")
     assert list(tmp_path.iterdir()) == []
+    # the sentence names the file as it would be called, not the unfinished one
+    assert (
+        f"cannot write {out}/"
+        in run("run", folder / "base.ply", folder / "draft.ply", "-o", out).err
+    )
+    (out := tmp_path / "used").mkdir()
+    (out / "mine.txt").write_text("kept")
+    assert (
+        f"cannot write {out}/"
+        in run("run", folder / "base.ply", folder / "draft.ply", "-o", out).err
+    )
+    assert [path.name for path in out.iterdir()] == ["mine.txt"]
 
 
 @pytest.mark.parametrize("foreign", [False, True])
@@ -639,6 +651,21 @@ def test_faults_of_logs_are_one_sentence(logs: Path, tmp_path: Path, run: Run) -
 def test_odometry_of_maps_is_told(folder: Path, tmp_path: Path, run: Run) -> None:
     words = ("run", folder / "base.ply", folder / "draft.ply", "-o", tmp_path / "o")
     told(run(*words, "--odometry", "loam"), "raw logs")
+
+
+def test_a_way_without_its_map_is_not_left(
+    logs: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from commonmap.io import las
+
+    def full(*args: Any) -> Any:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(las, "_record", full)
+    way, cloud = tmp_path / "way.tum", tmp_path / "map.laz"
+    done = run("odometry", logs / "ugv" / "log.mcap", "-o", way, "--cloud", cloud, "-q")
+    told(done, f"cannot write {cloud}: no space left on device")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_what_is_left_of_a_bag_is_read_where_it_is_asked_for(

@@ -51,6 +51,8 @@ def test_a_full_disk_is_one_sentence(tmp_path: Path) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     assert str(caught.value) == f"cannot write {target}: no space left on device"
     assert names(tmp_path) == []
+    with pytest.raises(OutputError, match="no space left on device"), writing(target):
+        raise OSError("7892 requested and 6080 written")  # NumPy's tofile
 
 
 def test_places_where_no_file_can_be(tmp_path: Path) -> None:

@@ -302,6 +302,7 @@ def odometry_command(
     """Find the way of the lidar of a raw log, and its level, deskewed map."""
     from commonmap import cli_logs, cli_results
     from commonmap.cli_progress import telling
+    from commonmap.io.atomic import writing_all
     from commonmap.io.formats import find_writer, write_map
     from commonmap.io.logs import read_poses
     from commonmap.io.trajectory import write_trajectory
@@ -321,9 +322,10 @@ def odometry_command(
         robot = cli_logs.take_log(log, options, progress)
         errors = None if known is None else compare(robot.trajectory, known)
         progress("write the results")
-        write_trajectory(out, robot.trajectory)
-        if cloud is not None:
-            write_map(cloud, robot.cloud)
+        with writing_all(out, *([] if cloud is None else [cloud])) as parts:
+            write_trajectory(parts[0], robot.trajectory)
+            for part in parts[1:]:
+                write_map(part, robot.cloud)
     if not quiet:
         print(
             f"{robot.n_turns} turns, {robot.way:.1f} m; lost in {robot.odometry.n_lost}, "

@@ -17,7 +17,7 @@ import numpy as np
 from commonmap.config import Config
 from commonmap.errors import InputError, OutputError
 from commonmap.frames import check_T, from_rotation
-from commonmap.io.atomic import writing, writing_folder
+from commonmap.io.atomic import told_as, writing, writing_folder
 from commonmap.io.formats import write_map
 from commonmap.io.nav2 import write_nav2_map
 from commonmap.io.raster import write_geotiff
@@ -342,7 +342,8 @@ def results_folder(path: Path) -> Iterator[Path]:
     try:
         part = Path(tempfile.mkdtemp(prefix=".commonmap-", dir=real))
         try:
-            yield part
+            with told_as(part, real):
+                yield part
             fresh = os.listdir(part)
             for name in fresh:
                 os.replace(part / name, real / name)

@@ -41,7 +41,10 @@ def writing_all(*paths: PathLike) -> Iterator[tuple[Path, ...]]:
     first = targets[0] if targets else Path()
     try:
         try:
-            yield parts
+            with contextlib.ExitStack() as named:
+                for part, target in zip(parts, targets, strict=True):
+                    named.enter_context(told_as(part, target))
+                yield parts
             for part, target in zip(parts, targets, strict=True):
                 if not part.is_file():
                     raise OutputError(f"cannot write {target}: nothing was written")
@@ -74,7 +77,8 @@ def writing_folder(path: PathLike, *, replaces: Collection[str] = ()) -> Iterato
         part, old = _beside(target, "part"), _beside(target, "old")
         try:
             part.mkdir()
-            yield part
+            with told_as(part, target):
+                yield part
             if target.exists():
                 os.rename(target, old)
             try:
@@ -89,6 +93,15 @@ def writing_folder(path: PathLike, *, replaces: Collection[str] = ()) -> Iterato
                     shutil.rmtree(leftover, ignore_errors=True)
     except OSError as error:
         raise OutputError(f"cannot write the folder {target}: {_reason(error)}") from error
+
+
+@contextlib.contextmanager
+def told_as(part: Path, target: Path) -> Iterator[None]:
+    """Name a file of a folder that is being written as it would be called in the end."""
+    try:
+        yield
+    except OutputError as error:
+        raise OutputError(str(error).replace(str(part), str(target))) from error
 
 
 def _target(path: Path) -> Path:
@@ -143,4 +156,6 @@ def _rename_all(parts: tuple[Path, ...], targets: list[Path]) -> None:
 
 
 def _reason(error: OSError) -> str:
+    if error.strerror is None and "requested and" in str(error):
+        return "no space left on device"  # so NumPy says how many items it could not write
     return (error.strerror or str(error) or type(error).__name__).lower()
