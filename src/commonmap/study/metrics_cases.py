@@ -61,7 +61,7 @@ def record_place(
     """Return a new place of a kind, recorded by both robots; arguments as in `simulate_pair`."""
     pair = simulate_pair(
         kind, rng=rng, drift=drift, tilt=tilt, change=change, size=PLACE, draft_size=DRIVEN,
-        azimuth_decimation=5, max_points=350_000,
+        azimuth_decimation=8, max_points=180_000,
     )  # fmt: skip
     clouds = (pair.target, pair.target_trajectory, pair.target_mission), (
         pair.source, pair.source_trajectory, pair.source_mission,

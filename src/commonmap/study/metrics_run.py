@@ -19,6 +19,7 @@ from typing import Any
 from commonmap.errors import InputError, MissingExtraError, OutputError
 from commonmap.study.metrics_design import PlacePlan, plan_study, run_place
 from commonmap.study.metrics_scores import LABELS
+from commonmap.study.metrics_times import measure_times
 from commonmap.types import Progress, no_progress
 from commonmap.version import __version__
 
@@ -53,6 +54,8 @@ def run_study(
     progress("pairs", 1.0 - len(missing) / len(plans))
     if missing:
         _run_missing(missing, len(plans), seed, scheduler, workers, task, progress)
+    if not (out / "times.json").exists():
+        _write_once(out / "times.json", measure_times())
     return files
 
 
