@@ -249,11 +249,16 @@ def merge_command(
         Path, typer.Option("-o", "--out", help="Common map: .ot .bt (octree) .ply .pcd .las .laz.")
     ],
     resolution: Resolution = None,
+    mode: Annotated[
+        str | None,
+        typer.Option("--mode", help="Of two opinions on a voxel: add, keep-target, occupied-wins."),
+    ] = None,
     config: ConfigFile = None,
     quiet: Quiet = False,
 ) -> int:
     """Merge two maps whose match is known into one file, in BASE's frame."""
     settings = _settings(config, None, None, resolution, None, None)
+    settings = settings.with_values(merge={"mode": mode})
     from commonmap import cli_results, pipeline
     from commonmap.cli_progress import telling
     from commonmap.io.formats import find_writer, write_map

@@ -42,6 +42,7 @@ ENTRIES = (
 
 HEIGHT_LAYERS = (
     "ground", "highest", "height", "highest_target", "highest_source", "seen_by", "conflict",
+    "free_height",
 )  # fmt: skip
 """Bands of height_map.tif, in this order."""
 

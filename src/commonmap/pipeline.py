@@ -18,6 +18,7 @@ from commonmap.frames import apply, check_points, check_T
 from commonmap.mapping.points import points_of
 from commonmap.matching.areas import match_areas
 from commonmap.matching.match import match
+from commonmap.merging.free_space import free_height_layer
 from commonmap.merging.products import (
     CommonMap,
     Map,
@@ -101,6 +102,8 @@ def merge_maps(
     # 5. height map of the plan: layers (nx, ny)
     progress("common height map")
     heights = merge_heights(xyz_target, xyz_source, cell=resolution, config=config.merge)
+    free = free_height_layer(heights, tree.leaves, octree_origin)
+    heights = replace(heights, layers={**heights.layers, "free_height": free})
 
     # 6. where a robot may drive: (nx, ny) of free, occupied, unknown
     progress("navigation map")

@@ -53,7 +53,8 @@ class CommonMap:
         (a map in UTM), then whole hundreds of metres.
     heights: GridMap with the layers ground, highest, height (and highest_target, height_target,
         highest_source, height_source), float32 with NaN for unknown; ground_seen bool; seen_by
-        uint8; conflict bool, one robot saw an obstacle where the other saw bare ground.
+        uint8; conflict bool, one robot saw an obstacle where the other saw bare ground; free_height
+        float32, up to which height above ground a column was seen free without a gap.
     navigation: GridMap of the same cells with the layer occupancy, int8: 0 free, 100 occupied,
         -1 unknown.
     """
@@ -217,7 +218,7 @@ def choose_octree_origin(xyz: Float64s, resolution: float) -> Float64s:
     if ((low - shift < -reach) | (high - shift > reach)).any():
         raise InputError(
             f"an octree with voxels of {resolution:g} m spans at most {2 * reach:.0f} m; "
-            f"the common map spans {float((high - low).max()):.0f} m: give a coarser --resolution"
+            f"this one would span {float((high - low).max()):.0f} m: give a coarser --resolution"
         )
     return np.asarray(shift, dtype=np.float64)
 
