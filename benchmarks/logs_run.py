@@ -2,6 +2,7 @@
 
     python benchmarks/logs_run.py                       # ten seeds, 120 s a log: about 25 minutes
     python benchmarks/logs_run.py --seeds 0 1 --seconds 60
+    python benchmarks/logs_run.py --seeds 3 --logs /tmp/logs   # logs made once; other rows stay
 
 For each seed a place is made (the kinds take turns), a drone flies over it and a ground robot
 drives in it for so many seconds; each lidar's packets, or messages, are written as a sensor would,
@@ -9,7 +10,7 @@ and the command is run as a user would run it, on two threads. The truth is the 
 each map and the true places of its points; the answer is judged in the middle of the draft. The
 level is judged by the same motion. CPU seconds are of the command and what it starts; wall seconds
 say little where other jobs share the machine, so the load is told beside them.
-Raw figures go to `benchmarks/records/logs_run.json`.
+Raw figures go to `benchmarks/records/logs_run.json`; rows of other seeds that are there stay.
 """
 
 from __future__ import annotations
@@ -55,8 +56,10 @@ def simulate(folder: Path, seed: int, seconds: float) -> tuple[str, dict[str, Mi
     missions = {"base": plan.flight, "draft": plan.ground}
     worlds = {"base": plan.world, "draft": plan.source_world}
     for part, mission in missions.items():
-        (folder / part).mkdir()
-        write(folder / part, mission, worlds[part], int(rng.integers(2**31)), seconds, LOGS[part])
+        own = int(rng.integers(2**31))
+        if not (folder / part / f"log.{LOGS[part]}").exists():
+            (folder / part).mkdir(parents=True, exist_ok=True)
+            write(folder / part, mission, worlds[part], own, seconds, LOGS[part])
     return kind, missions
 
 
@@ -71,11 +74,11 @@ def write(
     write_logs(folder, turns, mission.sensor, VLP16, [kind])
 
 
-def run_command(folder: Path) -> dict[str, Any]:
+def run_command(folder: Path, out: Path) -> dict[str, Any]:
     """Run the command on the two logs; return what it cost and said."""
     command = [
         sys.executable, "-m", "commonmap.cli", "run", str(folder / "base" / "log.pcap"),
-        str(folder / "draft" / "log.mcap"), "-o", str(folder / "out"), "-q",
+        str(folder / "draft" / "log.mcap"), "-o", str(out), "-q",
     ]  # fmt: skip
     threads = {"NUMBA_NUM_THREADS": "2", "OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
     before, begin = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
@@ -121,23 +124,31 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
     parser.add_argument("--seeds", nargs="+", type=int, default=list(range(10)))
     parser.add_argument("--seconds", type=float, default=120.0)
+    parser.add_argument("--logs", type=Path, help="keep the simulated logs here, use those there")
+    parser.add_argument("--only-simulate", action="store_true")
     parser.add_argument("-o", "--output", type=Path, default=RECORDS / "logs_run.json")
     args = parser.parse_args()
-    rows = []
+    old = json.loads(args.output.read_text(encoding="utf-8")) if args.output.is_file() else {}
+    found = {r["seed"]: r for r in old.get("rows", []) if old.get("seconds") == args.seconds}
     for seed in args.seeds:
         with tempfile.TemporaryDirectory() as name:
-            kind, missions = simulate(Path(name), seed, args.seconds)
-            row = {"seed": seed, "kind": kind, **run_command(Path(name))}
+            folder = Path(name) if args.logs is None else args.logs / str(seed)
+            kind, missions = simulate(folder, seed, args.seconds)
+            if args.only_simulate:
+                continue
+            row = {"seed": seed, "kind": kind, **run_command(folder, Path(name) / "out")}
             if row["code"] in (0, 3):
                 row |= judge(Path(name) / "out", missions)
-        rows.append(row)
+        found[seed] = row
         print(json.dumps(row), flush=True)
+        rows = [found[seed] for seed in sorted(found)]
         values = {
-            "command": " ".join(["python benchmarks/logs_run.py", *sys.argv[1:]]),
+            "command": "python benchmarks/logs_run.py",
             "machine": f"{platform.machine()}, {os.cpu_count()} cores, shared with other jobs",
             "seconds": args.seconds, "rows": rows,
         }  # fmt: skip
         args.output.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
+    rows = list(found.values())
     good = [r for r in rows if r.get("metres", 9) < 0.2 and r.get("degrees", 9) < 0.3]
     print(f"{len(good)} of {len(rows)} within 0.2 m and 0.3 deg")
     return 0

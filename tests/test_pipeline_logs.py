@@ -40,11 +40,17 @@ def recorded(robot: str, seconds: float) -> tuple[tuple[Scan, ...], Mission]:
 def test_a_log_becomes_a_level_map_from_the_start(robot: str, seconds: float) -> None:
     scans, mission = recorded(robot, seconds)
     told: list[tuple[str, float]] = []
+    read = 0
+
+    def turns() -> Iterator[Scan]:
+        nonlocal read
+        for read, scan in enumerate(scans, 1):  # noqa: B007
+            yield scan
 
     def tell(step: str, share: float = 0.0) -> None:
         told.append((step, share))
 
-    made = map_log(lambda: iter(scans), max_points=200_000, n_scans=len(scans), progress=tell)
+    made = map_log(turns, max_points=200_000, share=lambda: read / len(scans), progress=tell)
     T_world_map, off = fit_truth(made.cloud, made.trajectory, mission.sensor)
     assert math.degrees(math.acos(min(1.0, T_world_map[2, 2]))) < 0.6
     assert off < 0.15
@@ -57,6 +63,8 @@ def test_a_log_becomes_a_level_map_from_the_start(robot: str, seconds: float) ->
     start = np.linalg.norm(made.cloud.origin, axis=1).min()
     assert start < 0.5
     assert (made.n_turns, made.n_left_out, made.troubles) == (len(scans), 0, ())
+    shares = [share for step, share in told if step == "odometry of the log"]
+    assert shares == [0.0, 0.25, 0.5, 0.75, 1.0]
     assert [step for step, share in told if share == 0.0] == [
         "odometry of the log", "map of the log", "level the map of the log",
     ]  # fmt: skip

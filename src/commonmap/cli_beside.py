@@ -115,6 +115,7 @@ class _Beside:
                 self._error = RuntimeError(f"in the process that read {self._path}:\n{value}")
             else:
                 self._result = value
+                self._progress(f"{self._path.name} is ready", 1.0)
 
 
 class _Sender(logging.Handler):

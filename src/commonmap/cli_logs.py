@@ -19,7 +19,7 @@ from commonmap.io.logs import (
 )
 from commonmap.odometry import ODOMETRY
 from commonmap.pipeline_logs import RobotMap, map_log
-from commonmap.types import Cloud, Leaves, Progress, Scan, Trajectory
+from commonmap.types import Cloud, Leaves, Progress, Scan, Trajectory, no_progress
 
 log = logging.getLogger("commonmap")
 
@@ -42,11 +42,11 @@ class LogOptions:
     model: str | None = None
     deskewed: bool | None = None
 
-    def scans(self, path: Path) -> Iterator[Scan]:
+    def scans(self, path: Path, progress: Progress = no_progress) -> Iterator[Scan]:
         """Yield the scans of a log."""
         return iter_scans(
             path, topic=self.topic, model=self.model, keep_partial=self.keep_partial,
-            deskewed=self.deskewed,
+            deskewed=self.deskewed, progress=progress,
         )  # fmt: skip
 
     def open(self, path: Path) -> Log:
@@ -126,9 +126,15 @@ def take_log(path: Path, options: LogOptions, progress: Progress) -> RobotMap:
         acceleration = read_acceleration(
             path, topic=options.topic, keep_partial=options.keep_partial
         )
+    read = 0.0
+
+    def hear(step: str, share: float = 0.0) -> None:
+        nonlocal read
+        read = share
+
     robot = map_log(
-        lambda: options.scans(path), method=method, poses=known, acceleration=acceleration,
-        n_scans=options.open(path).n_scans, name=path.name, progress=progress,
+        lambda: options.scans(path, hear), method=method, poses=known, acceleration=acceleration,
+        share=lambda: read, name=path.name, progress=progress,
     )  # fmt: skip
     for note in robot.notes:
         log.warning("%s: %s", path.name, note)

@@ -13,7 +13,7 @@ import numpy as np
 
 from commonmap.config import Config
 from commonmap.frames import difference, invert
-from commonmap.io.logs import iter_scans, open_log
+from commonmap.io.logs import iter_scans
 from commonmap.odometry import TrajectoryErrors, compare
 from commonmap.pipeline import Result, run
 from commonmap.pipeline_logs import RobotMap, map_log
@@ -111,8 +111,13 @@ def write_log(
 
 def map_file(path: Path, *, method: str, progress: Progress) -> RobotMap:
     """Return the level map of a log."""
-    log = open_log(path)
+    read = 0.0
+
+    def hear(step: str, share: float = 0.0) -> None:
+        nonlocal read
+        read = share
+
     return map_log(
-        lambda: iter_scans(path), method=method, n_scans=log.n_scans,
+        lambda: iter_scans(path, progress=hear), method=method, share=lambda: read,
         name=f"{path.parent.name}/{path.name}", progress=progress,
     )  # fmt: skip

@@ -77,7 +77,7 @@ def map_log(
     poses: Trajectory | None = None,
     acceleration: Acceleration | None = None,
     max_points: int = MAX_POINTS,
-    n_scans: int | None = None,
+    share: Callable[[], float] | None = None,
     name: str = "the log",
     progress: Progress = no_progress,
 ) -> RobotMap:
@@ -87,16 +87,16 @@ def map_log(
         memory at a time.
     method: a row of `ODOMETRY`. poses: known poses of the sensor, for method "poses"; the map is
         then in their frame, as it is. acceleration: of an IMU, where the log has one.
-    n_scans: of the log where known, for the progress. name: of the log in the progress.
+    share: tells what share of the log has been read, for the progress. name: of the log there.
     """
     # 1. where the sensor was at each turn; the frame is that of the sensor at the start
-    turns = _telling(read(), f"odometry of {name}", n_scans, progress)
+    turns = _telling(read(), f"odometry of {name}", share, progress)
     answer = estimate(turns, method=method, poses=poses)
     _require_some(answer, name)
 
     # 2. every point at its place, deskewed; what lies in one voxel is kept once: (N, 3)
     gathered = Accumulator(max_points=max_points)
-    turns = _telling(read(), f"map of {name}", n_scans, progress)
+    turns = _telling(read(), f"map of {name}", share, progress)
     counted = _Counter(answer)
     for cloud in georeference(counted.placeable(complete_scans(turns, [])), answer.trajectory):
         gathered.add(cloud)
@@ -173,13 +173,13 @@ def describe_robot(robot: RobotMap, errors: TrajectoryErrors | None = None) -> d
 
 
 def _telling(
-    scans: Iterable[Scan], step: str, n_scans: int | None, progress: Progress
+    scans: Iterable[Scan], step: str, share: Callable[[], float] | None, progress: Progress
 ) -> Iterator[Scan]:
     progress(step)
     for number, scan in enumerate(scans):
         yield scan
-        if n_scans and number % 20 == 19:
-            progress(step, min(1.0, (number + 1) / n_scans))
+        if share is not None and number % 20 == 19:
+            progress(step, share())
 
 
 class _Counter:
