@@ -297,6 +297,11 @@ def test_a_cloud_in_large_coordinates_gets_a_moved_frame(
         (["cloud.ply", "-o", "map.ot", "--poses", "poses.tum"], "have none"),
         (["cloud.ply", "-o", "map.ot", "--max-range", "9"], "max_range needs"),
         (["cloud.ply", "-o", "map.ot", "--discretize"], "discretize needs"),
+        (["cloud.ply", "-o", "map.ot", "--deskewed"], "--deskewed"),
+        (
+            ["cloud.ply", "-o", "map.ot", "--origin", "0", "0", "9000", "--max-range", "9"],
+            "none does",
+        ),
         (["map.bt", "-o", "map.ot"], "octree already"),
         (["log", "-o", "nowhere/map.ot"], "nowhere"),
     ],

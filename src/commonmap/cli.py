@@ -380,6 +380,8 @@ def octree_command(
     ] = False,
     threads: Annotated[int, typer.Option(help="Threads; the file is the same for any.")] = 1,
     topic: Annotated[str | None, typer.Option(help="Raw log: topic of the scans.")] = None,
+    model: Model = None,
+    deskewed: Deskewed = None,
     keep_partial: KeepPartial = False,
     quiet: Quiet = False,
 ) -> int:
@@ -392,7 +394,9 @@ def octree_command(
     tree = cli_octree.make_tree(
         resolution, l_occ=l_occ, l_free=l_free, l_min=l_min, l_max=l_max, threads=threads
     )
-    options = cli_octree.Options(max_range, discretize, poses, origin, topic, keep_partial)
+    options = cli_octree.Options(
+        max_range, discretize, poses, origin, topic, keep_partial, model, deskewed
+    )
     with _notes(quiet), telling(quiet=quiet) as progress:
         told = cli_octree.fill(tree, source, options, progress)
         progress("write the octree")

@@ -17,7 +17,7 @@ from commonmap.io.octomap import write_octree
 from commonmap.mapping.octree import Octree, probability
 from commonmap.mapping.octree_build import insert_cloud, insert_log
 from commonmap.merging.products import choose_octree_origin
-from commonmap.types import Cloud, Float64s, LeafParts, Leaves, Progress
+from commonmap.types import KEY_ORIGIN, Cloud, Float64s, LeafParts, Leaves, Progress
 
 LIDAR_REACH = 300.0
 """Metres around the sensor that a turn's points may lie in."""
@@ -28,7 +28,8 @@ class Options:
     """What is known of the rays, and wanted of them.
 
     max_range: metres. discretize: one ray a voxel. poses: file of the sensor's poses. origin: of a
-    cloud, where the sensor stood. topic, keep_partial: of a log, see `cli_logs.LogOptions`.
+    cloud, where the sensor stood. topic, keep_partial, model, deskewed: of a log, see
+    `cli_logs.LogOptions`.
     """
 
     max_range: float | None = None
@@ -37,6 +38,8 @@ class Options:
     origin: tuple[float, float, float] | None = None
     topic: str | None = None
     keep_partial: bool = False
+    model: str | None = None
+    deskewed: bool | None = None
 
     @property
     def reach(self) -> float:
@@ -51,8 +54,14 @@ class Options:
             raise InputError(f"--max-range must be metres above 0; {self.max_range:g} came")
         if is_log and self.origin is not None:
             raise InputError("--origin is for a cloud; a log says where its sensor was")
-        if not is_log and (self.topic is not None or self.keep_partial):
-            raise InputError("--topic and --keep-partial are for raw logs; this is a cloud")
+        if is_log:
+            return
+        for option, given in (
+            ("--topic", self.topic is not None), ("--keep-partial", self.keep_partial),
+            ("--model", self.model is not None), ("--deskewed", self.deskewed is not None),
+        ):  # fmt: skip
+            if given:
+                raise InputError(f"{option} is for raw logs; this is a cloud")
 
 
 def check_name(out: Path) -> None:
@@ -92,13 +101,27 @@ def fill(tree: Octree, source: Path, options: Options, progress: Progress) -> li
         raise InputError(f"there is no file or folder {source}")
     if cli_logs.is_log(source):
         options.check(is_log=True)
-        return _fill_from_log(tree, source, options, progress)
+        told = _fill_from_log(tree, source, options, progress)
+        _require_some(tree)
+        return told
     options.check(is_log=False)
     progress(f"read {source.name}")
     cloud = read_map(source)
     if isinstance(cloud, Leaves):
         raise InputError(f"{source} is an octree already; a log or a cloud was expected")
-    return _fill_from_cloud(tree, cloud, options, progress)
+    told = _fill_from_cloud(tree, cloud, options, progress)
+    _require_some(tree)
+    return told
+
+
+def _require_some(tree: Octree) -> None:
+    """Raise where nothing that was inserted lies in the octree."""
+    if not any(len(part.depth) for part in tree.leaf_parts(pruned=False)):
+        reach = KEY_ORIGIN * tree.resolution
+        raise EmptyMapError(
+            "an octree needs rays that begin within its reach, or points that lie there"
+            f" ({reach:g} m from its origin at {tree.resolution:g} m voxels); none does"
+        )
 
 
 def write(tree: Octree, out: Path, *, pruned: bool) -> list[str]:
@@ -121,10 +144,13 @@ def write(tree: Octree, out: Path, *, pruned: bool) -> list[str]:
 
 
 def _fill_from_log(tree: Octree, path: Path, options: Options, progress: Progress) -> list[str]:
-    how = cli_logs.LogOptions(None, options.poses, options.topic, options.keep_partial)
+    how = cli_logs.LogOptions(
+        None, options.poses, options.topic, options.keep_partial, options.model, options.deskewed
+    )
     robot = cli_logs.take_log(path, how, progress)
     places = robot.trajectory.T_map_sensor[:, :3, 3]
-    shift = _choose_shift(np.vstack([places - LIDAR_REACH, places + LIDAR_REACH]), tree)
+    reach = LIDAR_REACH if options.max_range is None else min(LIDAR_REACH, options.max_range)
+    shift = _choose_shift(np.vstack([places - reach, places + reach]), tree)
     left_out = insert_log(
         how.scans(path), tree,
         robot.odometry, max_range=options.reach, discretize=options.discretize, shift=shift,
