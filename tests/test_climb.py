@@ -36,7 +36,7 @@ def scene(seed: int, n_slabs: int = 3) -> tuple[SlabGrid, Columns]:
 
 def evidence(target: SlabGrid, columns: Columns, pose: Float64s) -> float:
     """Return the evidence at a pose, counted pose by pose."""
-    return evidence_at(target, columns, pose)[0]
+    return evidence_at(target, columns, pose).score
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -51,9 +51,9 @@ def test_a_top_scores_what_its_pose_does_and_no_start_scores_more(seed: int, eac
         level, columns, poses, yaw_step=0.05, least_pairs=1.0, starts=starts, each=each
     )
     for pose, top, told, n in zip(poses, tops, score, pairs, strict=True):
-        expected, n_expected = evidence_at(target, columns, top)
-        assert told == pytest.approx(expected, rel=1e-9, abs=1e-9)
-        assert n == n_expected
+        expected = evidence_at(target, columns, top)
+        assert told == pytest.approx(expected.score, rel=1e-9, abs=1e-9)
+        assert n == expected.n_pairs
         about = pose + starts * np.array([0.5 * CELL, 0.5 * CELL, 0.05])
         assert told >= max(evidence(target, columns, start) for start in about) - 1e-9
         # none of the 26 nodes about a top is higher

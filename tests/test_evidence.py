@@ -20,8 +20,11 @@ from commonmap.matching.evidence import (
     pack_slabs,
     scatter,
     signed_evidence,
+    sum_table,
     transform_target,
+    uncertainty,
     unpack,
+    weigh,
     xlogx_table,
 )
 from commonmap.matching.search import evidence_at
@@ -80,6 +83,30 @@ def test_a_table_worked_by_hand() -> None:
 @pytest.mark.parametrize("table", [(0, 0, 0, 0), (5, 0, 3, 0), (5, 5, 2, 2), (5, 2, 5, 2)])
 def test_a_side_that_never_varies_says_nothing(table: tuple[int, int, int, int]) -> None:
     assert signed_evidence(*table, xlogx_table(6)) == 0.0
+
+
+def test_evidence_is_weighed_by_what_it_explains() -> None:
+    # 10 pairs, 3 both, 1 each alone, 5 neither: the source's 4 of 10 leave 6.7301 nats of doubt
+    doubt = -(4 * math.log(0.4) + 6 * math.log(0.6))
+    assert doubt == pytest.approx(6.73012, abs=1e-5)
+    assert uncertainty(10, 4, xlogx_table(11)) == pytest.approx(doubt, abs=1e-12)
+    assert uncertainty(10, 0, xlogx_table(11)) == uncertainty(10, 10, xlogx_table(11)) == 0.0
+    both = np.array([[10, 4, 4, 3], [10, 4, 0, 0]])  # a slab in which the target has nothing
+    evidence, total = sum_table(both, xlogx_table(11))
+    assert evidence == pytest.approx(1.77740, abs=1e-5)
+    assert total == pytest.approx(2 * doubt, abs=1e-12)
+    assert weigh(evidence, total) == pytest.approx(1.77740**2 / (200.0 + 2 * 6.73012), abs=1e-5)
+    assert weigh(-300.0, 100.0) == -300.0
+
+
+def test_a_small_overlap_that_agrees_beats_a_large_one_that_half_agrees() -> None:
+    # nats alone say the opposite: 0.2 nats in each of 10,000 cells against 0.6 in each of 2,000
+    table = xlogx_table(10_001)
+    large = np.array([[10_000, 5_000, 5_000, 4_000]])
+    small = np.array([[2_000, 1_000, 1_000, 980]])
+    (e_large, d_large), (e_small, d_small) = sum_table(large, table), sum_table(small, table)
+    assert e_large > 1.5 * e_small
+    assert weigh(e_large, d_large) < 0.75 * weigh(e_small, d_small)
 
 
 def test_xlogx_is_zero_at_zero_and_at_one() -> None:
@@ -326,9 +353,9 @@ def test_one_pose_by_counting_equals_the_surface() -> None:
     )  # fmt: skip
     for u, v in [(11, 11), (14, 12), (16, 18), (20, 9)]:
         pose = np.array([u - (side - 1) - low[0], v - (side - 1) - low[1], yaw])
-        evidence, pairs = evidence_at(grid, columns, pose)
-        assert evidence == pytest.approx(float(score[u, v]), abs=1e-4)
-        assert pairs == overlap[u, v]
+        standing = evidence_at(grid, columns, pose)
+        assert standing.score == pytest.approx(float(score[u, v]), abs=1e-4)
+        assert standing.n_pairs == overlap[u, v]
 
 
 def test_support_of_a_true_pose_and_of_a_half_true_one() -> None:
@@ -363,5 +390,5 @@ def test_areas_of_the_support_sum_to_the_evidence() -> None:
     support = measure_support(grid, source, np.zeros(3))
     # the table starts at half a pair in each of its cells, so the sums agree but for that
     assert support.evidence.sum() == pytest.approx(
-        evidence_at(grid, source, np.zeros(3))[0], rel=0.01
+        evidence_at(grid, source, np.zeros(3)).evidence, rel=0.01
     )

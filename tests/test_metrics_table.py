@@ -72,14 +72,15 @@ def test_evidence_literal_table() -> None:
     occupied_t = np.array([[1, 1, 0, 0, 0, 0, 1, 1]], bool)
     known = np.array([[1, 1, 1, 1, 1, 1, 1, 0]], bool)  # n11 2, n10 1, n01 1, n00 3
     expected = 2 * np.log(2 * 7 / 9) + 2 * np.log(1 * 7 / 12) + 3 * np.log(3 * 7 / 16)
+    doubt = -(3 * np.log(3 / 7) + 4 * np.log(4 / 7))  # what the source leaves open
     value = evidence_direct(occupied_s, known, occupied_t, np.ones_like(known))
-    assert value == pytest.approx(expected, abs=1e-12)
+    assert value == pytest.approx(expected**2 / (200 + doubt), abs=1e-12)
     inverted = evidence_direct(occupied_s, known, ~occupied_t, np.ones_like(known))
-    assert inverted == pytest.approx(-expected, abs=1e-12)
+    assert inverted == pytest.approx(-(expected**2) / (200 + doubt), abs=1e-12)
     twice = evidence_direct(
         *(np.repeat(x, 2, axis=0) for x in (occupied_s, known, occupied_t, np.ones_like(known)))
     )
-    assert twice == pytest.approx(2 * expected, abs=1e-12)
+    assert twice == pytest.approx((2 * expected) ** 2 / (200 + 2 * doubt), abs=1e-12)
 
 
 @pytest.mark.parametrize("row", METRICS.values(), ids=lambda row: row.name)

@@ -98,9 +98,9 @@ def test_no_pose_of_a_grid_beats_the_answer(seed: int) -> None:
     for yaw in np.arange(44) * 2.0 * math.pi / 44:
         for x in np.arange(grid.origin[0], grid.origin[0] + grid.shape[0] * grid.cell, 2.0):
             for y in np.arange(grid.origin[1], grid.origin[1] + grid.shape[1] * grid.cell, 2.0):
-                score, pairs = evidence_at(grid, columns, np.array([x, y, yaw]))
-                if pairs >= 0.3 * len(columns.xy) / 4.0:
-                    best = max(best, score)
+                at = evidence_at(grid, columns, np.array([x, y, yaw]))
+                if at.n_pairs >= 0.3 * len(columns.xy) / 4.0:
+                    best = max(best, at.score)
     assert found.score[0] >= best
 
 
@@ -125,8 +125,8 @@ def test_the_score_of_a_peak_is_the_evidence_at_its_pose() -> None:
     assert np.all(np.diff(found.score) <= 0)
     columns = about(list_columns(draft), found.centre)
     for rank in range(3):
-        score, _ = evidence_at(coarse(base), columns, found.pose[rank])
-        assert score == pytest.approx(found.score[rank], rel=1e-9)
+        at = evidence_at(coarse(base), columns, found.pose[rank])
+        assert at.score == pytest.approx(found.score[rank], rel=1e-9)
 
 
 def test_the_mirrored_search_finds_a_mirrored_map_and_not_the_true_one() -> None:

@@ -56,7 +56,8 @@ def test_both_halves_of_a_right_pose_find_it_again(seed: int) -> None:
     assert min(halves) > 1.2
 
 
-@pytest.mark.parametrize("seed", [3, 4, 5])
+# of other seeds the lucky overlap holds too little to be cut in two
+@pytest.mark.parametrize("seed", [3, 6, 8, 9, 10, 11, 12, 13])
 def test_a_lucky_overlap_falls_apart(seed: int) -> None:
     halves = halves_of(seed, seed + 50)
     assert halves is not None

@@ -18,7 +18,8 @@ from commonmap.matching.evidence import (
     SPREAD,
     Columns,
     count_bits,
-    signed_evidence,
+    sum_table,
+    weigh,
     xlogx_table,
 )
 from commonmap.matching.tiles import Level
@@ -188,11 +189,8 @@ def _score(  # type: ignore[no-untyped-def]
         laid[slot, 0], laid[slot, 1], t_occupied, t_known, i0, j0, lanes.shape[1] // 8, SPREAD,
         lanes,
     )  # fmt: skip
-    most = 0
-    total = 0.0
-    for k in range(n_slabs):
-        most = max(most, lanes[0, k])
-        total += signed_evidence(lanes[0, k], lanes[1, k], lanes[2, k], lanes[3, k], xlogx)
-    score[a, b, c] = total if most >= least_pairs else -np.inf
+    most = lanes[0, :n_slabs].max()
+    evidence, doubt = sum_table(lanes[:, :n_slabs].T, xlogx)
+    score[a, b, c] = weigh(evidence, doubt) if most >= least_pairs else -np.inf
     pairs[a, b, c] = most
     return score[a, b, c]

@@ -1,9 +1,15 @@
-"""Evidence that two maps saw the same place: signed n * MI summed over height slabs.
+"""Evidence that two maps saw the same place: n * MI over height slabs, weighed by what it explains.
 
 Per slab a cell that both maps know is occupied or not in each of them. At a pose the 2x2 table
 n11, n10, n01, n00 of these pairs gives the log-likelihood ratio of "dependent" against
-"independent", `G / 2 = n * MI` in nats (Wilks 1935), here negative where the association is. All
-translations of one yaw come exactly from cross-correlations of the binary layers:
+"independent", `G / 2 = n * MI` in nats (Wilks 1935), here negative where the association is. Its
+sum over the slabs, E, grows with the overlap wherever two places are built alike: halls that lie
+along each other on a whole map beat a small overlap that agrees in every wall. So E is weighed by
+the share of the source's uncertainty over the overlap, H = n H(source) in nats, that it takes away
+(Theil's coefficient U = MI / H, 1972), with `DOUBT` added to H: of a few cells a large share is
+explained by luck. The score is `E |E| / (H + DOUBT)`, nats too.
+
+All translations of one yaw come exactly from cross-correlations of the binary layers:
 
     n = known_s * known_t    n_1 = occupied_s * known_t    n_2 = known_s * occupied_t
     n11 = occupied_s * occupied_t
@@ -23,6 +29,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from commonmap.matching.arrays import NUMPY, Array, Arrays, borrow, invert, transform
+from commonmap.metrics.formulas import DOUBT
 from commonmap.types import Bools, Float32s, Float64s
 
 Bits = NDArray[np.unsignedinteger[Any]]
@@ -272,7 +279,7 @@ def _standing(occupied: Bits, n_slabs: int) -> tuple[bool, ...]:
 def evidence_surface(
     target: Spectra, occupied: Bits, known: Bits, *, min_overlap: float, workers: int
 ) -> tuple[Float32s, Float32s]:
-    """Return (evidence, overlap) at every translation of one turned source.
+    """Return (score, overlap) at every translation of one turned source.
 
     occupied, known: (sx, sy) slab bits of the source. Of all translations, (tx + sx - 1,
     ty + sy - 1), the answers hold those of `target.rows` and `target.columns`. Translation [u, v]
@@ -299,26 +306,34 @@ def evidence_surface(
         return invert(arrays, product, target.fft_shape, workers, role)[0][region]
 
     shape = tuple(high - low for low, high in (target.rows, target.columns))
-    total = arrays.xp.zeros(shape, np.float64)
+    total, doubt = arrays.xp.zeros(shape, np.float64), arrays.xp.zeros(shape, np.float64)
     overlap = arrays.xp.zeros(shape, np.float32)
     table = arrays.xp.asarray(xlogx_table(int(np.count_nonzero(known)) + 1))
+
+    def add(*counts: Array) -> None:
+        if arrays.name == "numpy":
+            _add_evidence(*counts, table, total, doubt)
+        else:
+            _add_evidence_on_device(arrays.xp, *counts, table, total, doubt)
+
     for k in range(n_slabs):
         t_known = target.known[min(k, target.known.shape[0] - 1)]
         if k == 0 or not shared:
             s_known = forward(bits_known, k, "evidence known")
             pairs = correlate(s_known, t_known, "evidence pairs")
             overlap = arrays.xp.maximum(overlap, arrays.xp.floor(pairs + 0.5))
-        if not (standing[k] and target.standing[k]):
-            continue  # a side that never varies says nothing
+        if not standing[k]:
+            continue  # a source that never varies says nothing
         s_occupied = forward(bits_occupied, k, "evidence occupied")
         source_side = correlate(s_occupied, t_known, "evidence source side")
+        if not target.standing[k]:
+            nothing = arrays.xp.zeros_like(source_side)
+            add(pairs, source_side, nothing, nothing)
+            continue
         target_side = correlate(s_known, target.occupied[k], "evidence target side")
         both = correlate(s_occupied, target.occupied[k], "evidence both")
-        counts = pairs, source_side, target_side, both
-        if arrays.name == "numpy":
-            _add_evidence(*counts, table, total)
-        else:
-            _add_evidence_on_device(arrays.xp, *counts, table, total)
+        add(pairs, source_side, target_side, both)
+    total = total * arrays.xp.abs(total) / (doubt + DOUBT)
     score = arrays.xp.where(overlap >= math.ceil(min_overlap), total, -np.inf).astype(np.float32)
     return arrays.to_host(score), arrays.to_host(overlap.astype(np.float32))
 
@@ -343,8 +358,31 @@ def signed_evidence(n, r, c, n11, xlogx):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
-def _add_evidence(pairs, source_side, target_side, both, xlogx, total):  # type: ignore[no-untyped-def]
-    """Add the evidence of one slab to `total`, from its four counts, not yet rounded."""
+def uncertainty(n, r, xlogx):  # type: ignore[no-untyped-def]
+    """Return n H (nats) of a source that has r of n cells occupied."""
+    return xlogx[n] - xlogx[r] - xlogx[n - r] if 0 < r < n else 0.0
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def weigh(evidence, doubt):  # type: ignore[no-untyped-def]
+    """Return the score of a pose: its evidence, by the share of the doubt that it takes away."""
+    return evidence * abs(evidence) / (doubt + DOUBT)
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def sum_table(table, xlogx):  # type: ignore[no-untyped-def]
+    """Return (evidence, doubt), nats, of a pose's table (n_slabs, 4): n, n_1, n_2, n11."""
+    evidence, doubt = 0.0, 0.0
+    for k in range(table.shape[0]):
+        n, r, c, n11 = table[k]
+        evidence += signed_evidence(n, r, c, n11, xlogx)
+        doubt += uncertainty(n, r, xlogx)
+    return evidence, doubt
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _add_evidence(pairs, source_side, target_side, both, xlogx, total, doubt):  # type: ignore[no-untyped-def]
+    """Add evidence and uncertainty of one slab, from its four counts, not yet rounded."""
     for u in range(total.shape[0]):
         for v in range(total.shape[1]):
             n = int(pairs[u, v] + 0.5)
@@ -352,11 +390,12 @@ def _add_evidence(pairs, source_side, target_side, both, xlogx, total):  # type:
             c = int(target_side[u, v] + 0.5)
             n11 = max(int(both[u, v] + 0.5), r + c - n, 0)
             total[u, v] += signed_evidence(n, r, c, min(n11, r, c), xlogx)
+            doubt[u, v] += uncertainty(n, r, xlogx)
 
 
 def _add_evidence_on_device(
     xp: Any, pairs: Array, source_side: Array, target_side: Array, both: Array, xlogx: Array,
-    total: Array,
+    total: Array, doubt: Array,
 ) -> None:  # fmt: skip
     """The same in whole arrays, each sum in the same order: the same bits."""
     n, r, c, n11 = ((x + 0.5).astype(np.int32) for x in (pairs, source_side, target_side, both))
@@ -366,6 +405,7 @@ def _add_evidence_on_device(
     varies = (r > 0) & (c > 0) & (r < n) & (c < n)
     agrees = n11.astype(np.int64) * n > r.astype(np.int64) * c
     total += (2.0 * agrees - 1.0) * g * varies
+    doubt += (xlogx[n] - xlogx[r] - xlogx[n - r]) * ((r > 0) & (r < n))
 
 
 def _spread_table() -> NDArray[np.uint64]:

@@ -29,7 +29,7 @@ def measure_figures(
     """
     grid = coarsen(base_layers.slabs, 2)
     columns = centre_columns(list_columns(draft_layers.slabs), found.centre, mirrored=False)
-    best_score, n_overlap = evidence_at(grid, columns, found.pose[0])
+    best = evidence_at(grid, columns, found.pose[0])
     elsewhere = other_poses(witness, found.pose[0], cell)
     second_score = float(witness.score[elsewhere].max(initial=0.0))
     decoy_score = float(decoy.score.max(initial=0.0))
@@ -39,9 +39,9 @@ def measure_figures(
     spread = 1.4826 * float(np.median(np.abs(yaw_best - middle)))
 
     return Figures(
-        evidence=best_score,
-        decoy_ratio=best_score / max(decoy_score, 1e-9),
-        second_ratio=best_score / max(second_score, 1e-9),
+        evidence=best.evidence,
+        decoy_ratio=best.score / max(decoy_score, 1e-9),
+        second_ratio=best.score / max(second_score, 1e-9),
         prominence=(float(yaw_best.max()) - middle) / max(spread, 1e-9),
         support=support.share,
         effect=support.effect,
@@ -50,7 +50,7 @@ def measure_figures(
         inliers=0.0,
         decoy_inliers=0.0,
         overlap=float(found.overlap[0]),
-        n_overlap=float(n_overlap),
+        n_overlap=float(best.n_pairs),
         moved=refined.moved[0] / cell,
         converged=float(refined.converged),
     )

@@ -89,9 +89,9 @@ def _ratio(
     peaks = search(target, half, min_overlap=HALF_OVERLAP, workers=workers)
     middle = found.T_target_source() @ np.array([*peaks.centre, 0.0, 1.0])
     pose = np.array([*middle[:2], found.pose[0, 2]])
-    here, _ = evidence_at(
+    here = evidence_at(
         grid, centre_columns(list_columns(half), peaks.centre, mirrored=False), pose
-    )
+    ).score
     away = other_poses(peaks, pose, cell)
     near = float(peaks.score[~away].max(initial=here))
     return near / max(float(peaks.score[away].max(initial=0.0)), 1e-9)

@@ -23,13 +23,14 @@ from commonmap.matching.evidence import (
     coarsen,
     count_tables,
     list_columns,
-    signed_evidence,
+    sum_table,
+    weigh,
     xlogx_table,
 )
 from commonmap.matching.tiles import Level, Sweep, find_level, plan_tiles, search_tiles
 from commonmap.types import Float64s, Progress, no_progress
 
-CLOSE = 0.8
+CLOSE = 0.64
 """Peaks with at least this share of the best evidence climb from everywhere about them."""
 
 MOST_CLOSE = 8
@@ -41,8 +42,8 @@ class Peaks:
     """Planar poses, best first.
 
     pose: (M, 3) x, y, yaw of the source's centre in the target's frame.
-    score: (M,) evidence in nats. overlap: (M,) share of the source's known cells that meet known
-    cells of the target. centre: (2,) the point of the source's frame that x, y place.
+    score: (M,) nats, see `evidence.py`. overlap: (M,) share of the source's known cells that meet
+    known cells of the target. centre: (2,) the point of the source's frame that x, y place.
     per_yaw: (n_yaw, 2) yaw and the best score at it, of the coarse search.
     cell: metres, of the grid on which the scores were taken.
     """
@@ -156,8 +157,20 @@ def search(
     return Peaks(pose[order], score[order], overlap, centre, per_yaw, finest)
 
 
-def evidence_at(target: SlabGrid, columns: Columns, pose: Float64s) -> tuple[float, int]:
-    """Return (evidence, known pairs of the best known slab) of one pose x, y, yaw.
+@dataclass(frozen=True)
+class Standing:
+    """What speaks for one pose. score: of the search. evidence: nats, not weighed.
+
+    n_pairs: known pairs of the best known slab.
+    """
+
+    score: float
+    evidence: float
+    n_pairs: int
+
+
+def evidence_at(target: SlabGrid, columns: Columns, pose: Float64s) -> Standing:
+    """Return what speaks for one pose x, y, yaw.
 
     columns: of the source, about the point that x, y place, on half the target's cell.
     """
@@ -166,8 +179,8 @@ def evidence_at(target: SlabGrid, columns: Columns, pose: Float64s) -> tuple[flo
         columns.known, columns.n_slabs, np.asarray(pose, np.float64)[None],
     )[0]  # fmt: skip
     xlogx = xlogx_table(int(table[:, 0].max(initial=0)) + 1)
-    total = sum(signed_evidence(n, r, c, n11, xlogx) for n, r, c, n11 in table)
-    return float(total), int(table[:, 0].max())
+    evidence, doubt = sum_table(table, xlogx)
+    return Standing(float(weigh(evidence, doubt)), float(evidence), int(table[:, 0].max()))
 
 
 def _columns_at(source: SlabGrid, target: SlabGrid, cell: float) -> Columns:

@@ -27,7 +27,7 @@ from commonmap.types import Float64s
 First = TypeVar("First")
 Second = TypeVar("Second")
 
-CLOSE = 0.8
+CLOSE = 0.64
 """Peaks with at least this share of the best evidence are looked at on the points too."""
 
 MOST_RIVALS = 4

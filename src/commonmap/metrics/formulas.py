@@ -320,14 +320,20 @@ def mutual_information(a: Float64s, b: Float64s) -> float:
     return float(np.sum(joint[seen] * np.log(joint[seen] / np.outer(rows, columns)[seen])))
 
 
+DOUBT = 200.0
+"""Nats of uncertainty beside what the source shows: an overlap that shows much less explains little
+however well it agrees. Twice the evidence below which no pose is accepted."""
+
+
 def evidence_direct(occupied_s: Bools, known_s: Bools, occupied_t: Bools, known_t: Bools) -> float:
-    """Return the evidence, in nats, that two stacks of height slabs saw the same thing.
+    """Return the weighed evidence, in nats, that two stacks of height slabs saw the same thing.
 
     Each argument is (n_slabs, ...) bool, all of one shape, cell on cell. Per slab the 2x2 table of
     the cells known in both gives `G/2 = n * MI` (Wilks' log-likelihood ratio), negative where
-    the association `n11 n00 - n10 n01` is negative; the slabs are summed.
+    the association `n11 n00 - n10 n01` is negative; the slabs are summed to E. It is weighed by the
+    share of the source's uncertainty that it takes away: `E |E| / (n H(source) + DOUBT)`.
     """
-    total = 0.0
+    total, doubt = 0.0, 0.0
     for o_s, k_s, o_t, k_t in zip(occupied_s, known_s, occupied_t, known_t, strict=True):
         both = k_s & k_t
         s, t = o_s[both], o_t[both]
@@ -346,4 +352,7 @@ def evidence_direct(occupied_s: Bools, known_s: Bools, occupied_t: Bools, known_
             if cell > 0.0:
                 half_g += cell * float(np.log(cell * n / (row * column)))
         total += half_g if n11 * n00 - n10 * n01 >= 0.0 else -half_g
-    return total
+        for margin in (n11 + n10, n01 + n00):
+            if margin > 0.0:
+                doubt -= margin * float(np.log(margin / n))
+    return total * abs(total) / (doubt + DOUBT)

@@ -288,8 +288,10 @@ _IMAGE_ROWS = (
 )  # fmt: skip
 
 _EVIDENCE = Metric(
-    "evidence", "evidence (signed n·MI over height slabs)", "likelihood ratio",
-    "sum over slabs of sign(n11 n00 - n10 n01) n MI(occupied_s, occupied_t)", True, INF, -INF,
+    "evidence", "evidence (n·MI over height slabs, weighed by what it explains)",
+    "likelihood ratio",
+    "E |E| / (D + 200), over slabs E = sum sign(n11 n00 - n10 n01) n MI(occupied_s, occupied_t), "
+    "D = sum n H(occupied_s)", True, INF, -INF,
     True, f.evidence_direct, None, needs_positive=False, normalisations=HEIGHTS, layers="slabs",
     reference=WILKS, note="scored at every pose by matching.evidence, from height slabs",
 )  # fmt: skip
