@@ -310,11 +310,11 @@ def evidence_surface(
     overlap = arrays.xp.zeros(shape, np.float32)
     table = arrays.xp.asarray(xlogx_table(int(np.count_nonzero(known)) + 1))
 
-    def add(*counts: Array) -> None:
+    def add(pairs: Array, mine: Array, other: Array, both: Array) -> None:
         if arrays.name == "numpy":
-            _add_evidence(*counts, table, total, doubt)
+            _add_evidence(pairs, mine, other, both, table, total, doubt)
         else:
-            _add_evidence_on_device(arrays.xp, *counts, table, total, doubt)
+            _add_evidence_on_device(arrays.xp, pairs, mine, other, both, table, total, doubt)
 
     for k in range(n_slabs):
         t_known = target.known[min(k, target.known.shape[0] - 1)]
