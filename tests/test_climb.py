@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from commonmap.config import ComputeConfig
-from commonmap.matching.climb import HERE, climb_all, starts_around
-from commonmap.matching.evidence import Columns, SlabGrid
+from commonmap.matching.climb import HERE, climb_all, pack_planes, starts_around
+from commonmap.matching.evidence import Columns, SlabGrid, list_columns, pack_slabs
 from commonmap.matching.search import evidence_at
 from commonmap.matching.tiles import find_level
-from commonmap.types import Float64s
+from commonmap.types import Bools, Float64s
 
 CELL = 0.5
 IN_WINDOWS = ComputeConfig(memory_gb=1e-9)
@@ -138,3 +138,71 @@ def test_starts_are_whole_cells_and_yaws_apart_the_pose_first() -> None:
     )
     assert sorted(set(starts[:, 2].tolist())) == [-12, -6, 0, 6, 12]
     assert HERE.tolist() == [[0, 0, 0]]
+
+
+N_SLABS = 5
+
+
+def random_grid(
+    rng: np.random.Generator, shape: tuple[int, int], cell: float, *, shared: bool
+) -> SlabGrid:
+    """Return slabs with blobs, known alike in all slabs or each by itself."""
+    coarse = rng.random((N_SLABS, -(-shape[0] // 4), -(-shape[1] // 4))) < 0.3
+    occupied: Bools = np.kron(coarse, np.ones((1, 4, 4), bool))[:, : shape[0], : shape[1]]
+    known = rng.random((1 if shared else N_SLABS, *shape)) < 0.8
+    known = np.broadcast_to(known, occupied.shape)
+    return pack_slabs(np.array([3.0, -7.0]), cell, occupied & known, known)
+
+
+def test_planes_by_hand() -> None:
+    bits = np.zeros((2, 70), np.uint32)
+    bits[0, 0], bits[0, 63], bits[1, 64], bits[1, 69] = 1, 3, 2, 1
+    planes = pack_planes(bits, 2, 1)
+    assert planes.shape == (2, 4, 2)
+    assert planes[0, :, 0].tolist() == [0, 1 + (1 << 63), 0, 0]
+    assert planes[0, :, 1].tolist() == [0, 1 << 63, 0, 0]
+    assert planes[1, :, 0].tolist() == [0, 0, 1 << 5, 0]
+    assert planes[1, :, 1].tolist() == [0, 0, 1, 0]
+
+
+@pytest.mark.parametrize(
+    ("base_shared", "draft_shared"), [(True, True), (False, True), (True, False)]
+)
+@pytest.mark.parametrize("shape", [(40, 33), (150, 90)])
+def test_a_climb_ends_on_what_the_slow_twin_counts(
+    shape: tuple[int, int], base_shared: bool, draft_shared: bool
+) -> None:
+    rng = np.random.default_rng([shape[0], base_shared, draft_shared])
+    base = random_grid(rng, (170, 201), 0.5, shared=base_shared)
+    columns = list_columns(random_grid(rng, shape, 0.25, shared=draft_shared))
+    xy = np.ascontiguousarray(columns.xy - columns.xy.mean(axis=0))
+    draft = Columns(xy, columns.occupied, columns.known, columns.n_slabs)
+    # off the lattice, on it, over the rims, and beyond
+    starts = np.column_stack([rng.uniform((-5, -15), (95, 100), (12, 2)), rng.uniform(-9, 9, 12)])
+    starts[:6, :2] = base.origin + np.round((starts[:6, :2] - base.origin) / 0.5) * 0.5
+    starts[:6, 2] = 0.03 * np.round(starts[:6, 2] / 0.03)
+    starts[0, :2], starts[6, :2] = base.origin - 200.0, base.origin + 400.0
+    level = find_level(base, 1, ComputeConfig())
+    pose, score, pairs_found = climb_all(
+        level, draft, starts, yaw_step=0.03, least_pairs=1.0, starts=HERE
+    )
+    for n in range(len(starts)):
+        expected = evidence_at(base, draft, pose[n])
+        if expected.n_pairs == 0:
+            assert score[n] == -np.inf
+            continue
+        assert score[n] == pytest.approx(expected.score, rel=1e-9)
+        assert score[n] >= evidence(base, draft, starts[n]) - 1e-6
+        for k in range(3):  # nothing beside it is better
+            for step in (-1.0, 1.0):
+                beside = pose[n] + step * np.eye(3)[k] * np.array([0.25, 0.25, 0.03])
+                walked = np.abs(pose[n] - starts[n]) / np.array([0.25, 0.25, 0.03])
+                if walked.max() < 10.0:
+                    assert evidence(base, draft, beside) <= score[n] + 1e-6
+    assert not np.isfinite(score[[0, 6]]).any()
+    for workers in (1, 2, 3):
+        again = climb_all(
+            level, draft, starts, yaw_step=0.03, least_pairs=1.0, starts=HERE, workers=workers
+        )
+        for a, b in zip((pose, score, pairs_found), again, strict=True):
+            assert a.tobytes() == b.tobytes()

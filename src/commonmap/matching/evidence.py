@@ -227,7 +227,7 @@ def transform_target(
             zip(ranges, grid.shape, source_shape, strict=True)
         )
     )
-    shared = _is_shared(grid.known, grid.n_slabs)
+    shared = is_shared(grid.known, grid.n_slabs)
     n_source = source_shape[0] * source_shape[1] if n_source is None else n_source
     single = rounding((n_x, n_y), int(np.count_nonzero(grid.known)), n_source) < 0.5
     dtype = np.float32 if single else np.float64
@@ -265,7 +265,8 @@ def rounding(shape: tuple[int, int], n_target: int, n_source: int) -> float:
     return 0.5 * eps * float(np.log2(shape[0] * shape[1])) * float(np.sqrt(n_target * n_source))
 
 
-def _is_shared(known: Bits, n_slabs: int) -> bool:
+def is_shared(known: Bits, n_slabs: int) -> bool:
+    """Return whether every cell is known in all slabs or in none."""
     full = np.uint32((1 << n_slabs) - 1)
     return bool(np.all((known == 0) | (known == full)))
 
@@ -289,7 +290,7 @@ def evidence_surface(
     number of workers and any array module: what the transforms count are whole numbers.
     """
     arrays, n_slabs = target.arrays, len(target.standing)
-    shared = target.shared_known and _is_shared(known, n_slabs)
+    shared = target.shared_known and is_shared(known, n_slabs)
     standing = _standing(occupied, n_slabs)
     # turned round, a product of spectra is a cross-correlation
     bits_occupied = arrays.xp.asarray(np.ascontiguousarray(occupied[::-1, ::-1]))
