@@ -17,7 +17,7 @@ import numpy as np
 
 from commonmap.frames import apply, from_rotation, rotation_between
 from commonmap.mapping.ground import find_ground
-from commonmap.mapping.points import sample
+from commonmap.mapping.points import bounds, first_of_voxels, move, sample
 from commonmap.types import Float64s
 
 MAX_SIGMA = math.radians(2.0)
@@ -68,7 +68,7 @@ def find_level(xyz: Float64s) -> Levelling:
     R_rough = rotation_between(up, (0.0, 0.0, 1.0))
 
     # Exactly up: the direction along which what stands above ground makes the sharpest plan
-    standing = _standing(centred @ R_rough.T)
+    standing = _standing(centred if own else move(from_rotation(R_rough), centred))
     a, b, sigma = 0.0, 0.0, math.inf
     if len(standing) >= 500:
         a, b = _sharpest(standing, 0.0, 0.0, math.radians(12.0 if own else 30.0), peak_only=True)
@@ -98,10 +98,7 @@ def _standing(xyz: Float64s) -> Float64s:
     above = xyz[xyz[:, 2] - ground.height_at(xyz[:, :2]) > 0.5]
     if len(above) == 0:
         return above
-    key = np.floor((above - above.min(axis=0)) / 0.1).astype(np.int64)
-    span = key.max(axis=0) + 1
-    _, first = np.unique((key[:, 0] * span[1] + key[:, 1]) * span[2] + key[:, 2], return_index=True)
-    thin = above[np.sort(first)]
+    thin = above[first_of_voxels(above - bounds(above)[0], 0.1)]
     return np.ascontiguousarray(thin[:: len(thin) // 60_000 + 1])
 
 
@@ -175,22 +172,26 @@ def _shared_pairs(xyz, a, b, cell):  # type: ignore[no-untyped-def]
     tan_a, tan_b = np.tan(a), np.tan(b)
     low_x = low_y = np.inf
     high_x = high_y = -np.inf
+    plan = np.empty((xyz.shape[0], 2), np.float32)
     for k in range(xyz.shape[0]):
         x, y = xyz[k, 0] - tan_a * xyz[k, 2], xyz[k, 1] - tan_b * xyz[k, 2]
         low_x, high_x = min(low_x, x), max(high_x, x)
         low_y, high_y = min(low_y, y), max(high_y, y)
+        plan[k, 0], plan[k, 1] = x, y
     n = 64  # cells along a side; what lies further apart is folded onto it
     while n < 1024 and n * cell < max(high_x - low_x, high_y - low_y) + 2.0 * cell:
         n *= 2
-    pairs = 0.0
-    for shift in (0.0, 0.5):
-        count = np.zeros((n, n), np.int32)
+    pairs = 0
+    scale, fold = np.float32(1.0 / cell), n - 1
+    count = np.empty((n, n), np.int32)
+    for shift in (np.float32(0.0), np.float32(0.5)):
+        count[:] = 0
         for k in range(xyz.shape[0]):
-            i = int(np.floor((xyz[k, 0] - tan_a * xyz[k, 2]) / cell + shift)) & (n - 1)
-            j = int(np.floor((xyz[k, 1] - tan_b * xyz[k, 2]) / cell + shift)) & (n - 1)
+            i = np.int32(np.floor(plan[k, 0] * scale + shift)) & fold
+            j = np.int32(np.floor(plan[k, 1] * scale + shift)) & fold
             pairs += count[i, j]
             count[i, j] += 1
-    return pairs
+    return float(pairs)
 
 
 def _rough_up(xyz: Float64s) -> tuple[Float64s, bool]:

@@ -109,6 +109,12 @@ def thin(xyz: Float64s, voxel: float, n_most: int | None = None) -> Float64s:
     return xyz
 
 
+def first_of_voxels(xyz: Float64s, voxel: float) -> NDArray[np.int64]:
+    """Return the index of the first point of every voxel of a width in metres, rising."""
+    order, starts = _group(xyz, voxel)
+    return np.sort(order[starts[:-1]])
+
+
 def _group(xyz: Float64s, voxel: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the points' order by voxel, and where each voxel starts in it."""
     key = _voxel_keys(np.ascontiguousarray(xyz), 1.0 / voxel)
