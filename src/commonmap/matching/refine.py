@@ -11,13 +11,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from commonmap.frames import apply, from_rotation
 from commonmap.mapping.ground import Ground
 from commonmap.mapping.points import bounds, inside_box, move, thin
 from commonmap.matching.covariance import Pairs, Surface, measure_covariance, pair_points
+from commonmap.matching.neighbours import find_normals, index_points
 from commonmap.types import Float64s
 
 
@@ -103,7 +103,7 @@ def refine(
 
     # Walk from the search's peak on coarse clouds, then settle on finer ones
     T = _walk(target, source, cell, threads)
-    surface = _surface(target, voxel, threads)
+    surface = _surface(target, voxel)
     spacing = voxel
     for reach in (1.5 * cell, 0.75 * cell):
         T, pairs = _solve_point_to_plane(surface, source, T, reach=reach)
@@ -112,7 +112,7 @@ def refine(
     fine = max(0.05, 0.3 * voxel)
     if settle and fine < voxel and pairs is not None and 4.0 * pairs.scale < 0.75 * cell:
         reach, spacing = max(4.0 * pairs.scale, 2.0 * fine), fine
-        surface = _surface(thin(target_xyz[inside] - centre, fine, 4 * n_most), fine, threads)
+        surface = _surface(thin(target_xyz[inside] - centre, fine, 4 * n_most), fine)
         source = thin(moved_source - centre, fine, 2 * n_most)
         T, pairs = _solve_point_to_plane(surface, source, T, reach=reach)
     covariance, rms = np.eye(6), float("inf")
@@ -139,16 +139,10 @@ def refine(
     )
 
 
-def _surface(xyz: Float64s, voxel: float, threads: int) -> Surface:
-    """Return the points with their unit normals, from 20 neighbours."""
-    import small_gicp
-
-    cloud, _ = small_gicp.preprocess_points(
-        xyz, downsampling_resolution=voxel / 4.0, num_neighbors=20, num_threads=threads
-    )
-    points = np.ascontiguousarray(np.asarray(cloud.points())[:, :3])
-    normals = np.ascontiguousarray(np.asarray(cloud.normals())[:, :3])
-    return Surface(points, normals, cKDTree(points, balanced_tree=False))
+def _surface(xyz: Float64s, voxel: float) -> Surface:
+    """Return the points, one a voxel, with their unit normals, from 20 neighbours."""
+    index = index_points(xyz, voxel)
+    return Surface(xyz, find_normals(index, 20), index)
 
 
 def _walk(target: Float64s, source: Float64s, cell: float, threads: int) -> Float64s:
