@@ -42,10 +42,11 @@ class PlanIndex:
 
         Where none is nearer than the bound: infinity, and the number of points. One thread.
         """
-        return _query(
+        distance, index = _query(
             self.points, self.number, self.starts, self.low, self.size, *self.shape,
             np.ascontiguousarray(xyz, dtype=np.float64), distance_upper_bound,
-        )  # type: ignore[no-any-return]  # fmt: skip
+        )  # fmt: skip
+        return distance, index
 
 
 def index_points(xyz: Float64s, spacing: float) -> PlanIndex:
@@ -198,9 +199,7 @@ def _thinnest(points, near, found, normal):  # type: ignore[no-untyped-def]
         return
     p = np.sqrt(spread / 6.0)
     ra, rd, rf, rb, rc, re = (a - q) / p, (d - q) / p, (f - q) / p, b / p, c / p, e / p
-    half = 0.5 * (
-        ra * (rd * rf - re * re) - rb * (rb * rf - re * rc) + rc * (rb * re - rd * rc)
-    )
+    half = 0.5 * (ra * (rd * rf - re * re) - rb * (rb * rf - re * rc) + rc * (rb * re - rd * rc))
     angle = np.arccos(min(1.0, max(-1.0, half))) / 3.0
     least = q + 2.0 * p * np.cos(angle + 2.0 * np.pi / 3.0)
     # its eigenvector is across two rows of the matrix less the eigenvalue: the two most apart

@@ -1,8 +1,8 @@
 """From the grid's pose to the points' pose: z in closed form, then 6-DoF registration.
 
-small_gicp (generalised ICP, Segal et al. 2009) walks from the search's peak with correspondences of
-falling reach; a robust point-to-plane solve ends it, first on coarse points, then on fine ones.
-What the answer is worth is measured by `covariance.py`.
+Robust point-to-plane steps (Chen and Medioni 1992) walk from the search's peak, a few points with
+pairs of falling reach, then all coarse points, then fine ones. What the answer is worth is measured
+by `covariance.py`.
 """
 
 from __future__ import annotations
@@ -19,6 +19,9 @@ from commonmap.mapping.points import bounds, inside_box, move, thin
 from commonmap.matching.covariance import Pairs, Surface, measure_covariance, pair_points
 from commonmap.matching.neighbours import find_normals, index_points
 from commonmap.types import Float64s
+
+MOST_WALKING = 5_000
+"""Points of the source that walk from the search's peak."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +79,6 @@ def refine(
     T_target_source: Float64s,
     *,
     cell: float,
-    threads: int = 1,
     n_most: int = 20_000,
     settle: bool = True,
 ) -> Refined:
@@ -84,8 +86,7 @@ def refine(
 
     target_xyz: (N, 3), source_xyz: (M, 3) metres. cell: metres, of the search. Points are thinned
     to one per voxel of a third of the cell, or coarser to stay near `n_most`. settle: end on finer
-    points, and measure the covariance. threads: with more than one the last bits differ from run
-    to run (sums in any order).
+    points, and measure the covariance.
     """
     start = np.asarray(T_target_source, dtype=np.float64)
     moved_source = move(start, source_xyz)
@@ -101,10 +102,12 @@ def refine(
     target = thin(target_xyz[inside] - centre, voxel, 3 * n_most)
     source = thin(moved_source - centre, voxel, n_most)
 
-    # Walk from the search's peak on coarse clouds, then settle on finer ones
-    T = _walk(target, source, cell, threads)
+    # Walk from the search's peak with few points, then settle with more of them
     surface = _surface(target, voxel)
-    spacing = voxel
+    spacing, T = voxel, np.eye(4)
+    few = thin(source, cell, MOST_WALKING)
+    for reach in (3.0 * cell, 2.0 * cell, 1.5 * cell):
+        T, pairs = _solve_point_to_plane(surface, few, T, reach=reach)
     for reach in (1.5 * cell, 0.75 * cell):
         T, pairs = _solve_point_to_plane(surface, source, T, reach=reach)
 
@@ -143,28 +146,6 @@ def _surface(xyz: Float64s, voxel: float) -> Surface:
     """Return the points, one a voxel, with their unit normals, from 20 neighbours."""
     index = index_points(xyz, voxel)
     return Surface(xyz, find_normals(index, 20), index)
-
-
-def _walk(target: Float64s, source: Float64s, cell: float, threads: int) -> Float64s:
-    """Return the motion of generalised ICP from the identity, on clouds of about 10,000 points."""
-    import small_gicp
-
-    coarse_target, coarse_source = thin(target, cell / 3.0, 30_000), thin(source, cell, 10_000)
-    cloud, tree = small_gicp.preprocess_points(
-        coarse_target, downsampling_resolution=cell / 12.0, num_neighbors=12, num_threads=threads
-    )
-    draft, _ = small_gicp.preprocess_points(
-        coarse_source, downsampling_resolution=cell / 12.0, num_neighbors=12, num_threads=threads
-    )
-    T = np.eye(4)
-    for reach in (3.0 * cell, 1.5 * cell):
-        result = small_gicp.align(
-            cloud, draft, tree, init_T_target_source=T, registration_type="GICP",
-            max_correspondence_distance=reach, num_threads=threads, max_iterations=20,
-        )  # fmt: skip
-        if np.isfinite(result.T_target_source).all() and result.num_inliers >= 20:
-            T = np.asarray(result.T_target_source)
-    return T
 
 
 def _unrefined(start: Float64s, source_xyz: Float64s) -> Refined:
