@@ -7,17 +7,25 @@ driver says (structures of PCL are aligned to 16 bytes, `PCL_ADD_POINT4D` is x, 
 from __future__ import annotations
 
 import base64
+import os
 import struct
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from commonmap.io.logs import iter_scans
+from commonmap.io.logs import find_log, iter_scans
 from commonmap.io.logs.pointcloud2 import CloudReader, PointCloud2, PointField
 from commonmap.io.logs.record import Teller
 from log_files import DEFINITIONS, write_classic
+
+RECORDINGS = Path(
+    os.environ.get("COMMONMAP_RECORDINGS", Path(__file__).parents[2] / "shared/data/recordings")
+)
+"""Where recordings of other people's test suites may lie: those of velodyne_decoder (vlp16.pcap,
+vlp16.bag, at its releases) and of nebula (.db3 of VelodyneScan, in its repository)."""
 
 U1, U2, U4, F4, F8 = 2, 4, 6, 7, 8  # sensor_msgs/PointField
 STAMP = 1_700_000_000.25
@@ -225,3 +233,15 @@ def test_a_packet_of_a_real_sensor_against_another_decoder(tmp_path: Path) -> No
     assert (ring[nearest], intensity[nearest]) == (0, 9.0)
     # 382 of its 384 firings have a return between 0.4 and 100 m
     assert all(abs(len(scan.xyz) / 382 - 36000 / 404) < 1.5 for scan in scans)
+
+
+@pytest.mark.skipif(not RECORDINGS.is_dir(), reason=f"no recordings at {RECORDINGS}")
+def test_recordings_of_real_drivers_open() -> None:
+    paths = sorted(p for p in RECORDINGS.rglob("*") if find_log(p) is not None and p.is_file())
+    assert paths, f"{RECORDINGS} holds no log"
+    for path in paths:
+        scans = list(islice(iter_scans(path), 5))
+        assert scans, path
+        for scan in scans:
+            assert len(scan.xyz) > 1000 and len(np.unique(scan.ring)) >= 16, path
+            assert 0.02 < np.ptp(scan.time) < 0.5, path

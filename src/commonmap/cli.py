@@ -646,7 +646,7 @@ def _in_words(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.6g}" if abs(value) < 1e5 else f"{value:.3f}"
     if isinstance(value, list):
-        return ", ".join(_in_words(item) for item in value)
+        return ", ".join(_in_words(item) for item in value) or "none"
     return str(value)
 
 
