@@ -473,7 +473,12 @@ def demo_command(
 @app.command("simulate")
 def simulate_command(
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for logs, poses and truth.")],
-    scene: Annotated[str, typer.Option(help="Kind of place to simulate.")] = "paper",
+    scene: Annotated[str | None, typer.Option(help="Kind of place; paper unless told.")] = None,
+    world: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Your own place: .obj .glb .ply, or an airborne cloud."),
+    ] = None,
+    size: Annotated[float | None, typer.Option(help="Edge of the place, metres.")] = None,
     logs: Annotated[
         str, typer.Option(help="Raw logs to write: pcap, mcap, kitti, joined by commas, or none.")
     ] = "pcap,mcap,kitti",
@@ -492,17 +497,22 @@ def simulate_command(
     Each robot's folder holds its raw logs, its map with drifting poses, and its true poses.
     """
     settings = _settings(None, None, None, None, None, seed)
+    if scene is not None and world is not None:
+        raise InputError("--scene and --world both say what place it is; give one of them")
     import numpy as np
 
     from commonmap.cli_progress import telling
     from commonmap.sim.recording import MARGIN
     from commonmap.sim.simulate import write_simulation
+    from commonmap.sim.world_file import read_world
 
     with _notes(quiet), telling(quiet=quiet) as progress:
+        place = scene or "paper" if world is None else read_world(world, size=size)
         pair = write_simulation(
-            out, scene, np.random.default_rng(settings.seed), overlap=overlap, drift=drift,
+            out, place, np.random.default_rng(settings.seed), overlap=overlap, drift=drift,
             tilt=math.radians(tilt_deg), change=change, scans_every=0, seconds=seconds,
             logs=[] if logs == "none" else logs.split(","), margin=MARGIN, progress=progress,
+            size=size if world is None else None,
         )  # fmt: skip
     if not quiet:
         print(f"overlap: {100 * pair.overlap:.0f} % of the draft")

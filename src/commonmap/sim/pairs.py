@@ -86,18 +86,25 @@ class Plan:
 
 
 def plan_missions(
-    kind: str, *, rng: np.random.Generator, seed_world: int | None = None, change: float = 0.0,
-    size: float | None = None, relief: float | None = None, draft_size: float | None = None,
+    kind: str | World, *, rng: np.random.Generator, seed_world: int | None = None,
+    change: float = 0.0, size: float | None = None, relief: float | None = None,
+    draft_size: float | None = None,
     height: float | None = None, pitch: float | None = None, margin: float = 0.0,
     seconds: float | None = None,
 ) -> Plan:  # fmt: skip
     """Return a place, a flight over all of it, and a drive in a part of it; see `simulate_pair`.
 
+    kind: a name of `WORLDS`, or a world that is there already (`world_file.read_world`).
     seconds: a robot that would be back sooner goes slower, so that it is under way for so long.
     """
     if seed_world is None:
         seed_world = int(rng.integers(2**31))
-    world = build_world(kind, np.random.default_rng(seed_world), size=size, relief=relief)
+    if isinstance(kind, World):
+        if size is not None or relief is not None:
+            raise InputError("a world that is there already has its size and its relief")
+        world = kind
+    else:
+        world = build_world(kind, np.random.default_rng(seed_world), size=size, relief=relief)
     visited = change_world(world, change, rng) if change > 0 else world
     edge = draft_size if draft_size is not None else 0.45 * world.size
     room = max(0.0, (world.size - edge) / 2 - 2.0)
@@ -130,7 +137,7 @@ def _lasting(
 
 
 def simulate_pair(
-    kind: str,
+    kind: str | World,
     *,
     rng: np.random.Generator,
     seed_world: int | None = None,
@@ -153,7 +160,8 @@ def simulate_pair(
 ) -> Pair:
     """Return the maps of a drone (target) and a ground robot (source) of one place.
 
-    kind: a name of `WORLDS`. seed_world: seed of the place; drawn from `rng` unless given.
+    kind: a name of `WORLDS`, or a world. seed_world: seed of the place, drawn from `rng` unless
+        given.
     overlap: share of the source's cells that the target saw too; less than reachable is had by
         cutting the target along a line, as the border of a flight does. 1 leaves all there is.
     drift, target_drift: error of the poses, as share of the distance travelled.
@@ -212,7 +220,7 @@ def simulate_pair(
     if drift > 0:
         T_world_source_fit = fit_motion(draft_true, source.xyz)
     return Pair(
-        kind, target, source, invert(T_world_target_fit) @ T_world_source_fit,
+        world.name, target, source, invert(T_world_target_fit) @ T_world_source_fit,
         target_known, source_known, flight, ground, T_world_target_fit, T_world_source_fit,
         measure_overlap(base_true, draft_true), drift, tilt, change,
         border, max_range, world, visited, plan.seed_world,

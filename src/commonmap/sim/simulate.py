@@ -42,7 +42,7 @@ RETURN = np.dtype([("time", "<f8"), ("ring", "<u2")])
 
 def write_simulation(
     folder: str | os.PathLike[str],
-    kind: str,
+    kind: str | World,
     rng: np.random.Generator,
     *,
     seed_world: int | None = None,
