@@ -25,7 +25,8 @@ from commonmap.io import (
     write_geotiff,
     write_trajectory,
 )
-from commonmap.types import Cloud, Trajectory
+from commonmap.io.scans import iter_scans, write_scans
+from commonmap.types import Cloud, Scan, Trajectory
 
 N = 60
 RNG = np.random.default_rng(0)
@@ -190,6 +191,24 @@ def test_a_member_of_an_archive_takes_no_more_than_its_file_holds(tmp_path: Path
     tracemalloc.start()
     with contextlib.suppress(CommonmapError):
         read_map(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 10_000_000
+
+
+def test_a_header_of_an_array_is_no_longer_than_its_file(tmp_path: Path) -> None:
+    # versions 2 and 3 of NPY tell the length of the header in four bytes
+    (tmp_path / "map.npy").write_bytes(b"\x93NUMPY\x02\x00" + struct.pack("<I", 700_000_000))
+    none = np.zeros(N, np.float32)
+    scan = Scan(XYZ.astype(np.float32), np.arange(float(N)), none.astype(np.uint16), none, 0.0)
+    write_scans(tmp_path / "k", [scan])
+    ring = tmp_path / "k" / "ring" / "000000.npy"
+    ring.write_bytes(b"\x93NUMPY\x03\x00" + struct.pack("<I", 700_000_000) + ring.read_bytes()[12:])
+    tracemalloc.start()
+    with pytest.raises(CommonmapError):
+        read_map(tmp_path / "map.npy")
+    with pytest.raises(CommonmapError):
+        list(iter_scans(tmp_path / "k"))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 10_000_000

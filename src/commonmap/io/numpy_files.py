@@ -27,8 +27,8 @@ ATTRIBUTES = ("colour", "intensity", "time", "origin", "seen_by")
 def read_npy(path: PathLike) -> Cloud:
     """Return the points of an .npy file: (N, 3) or wider, or a structured array with x, y, z."""
     path, size, _ = look(path)
-    with parsing(path, "NPY"), open(path, "rb") as file:
-        columns = _columns(_read_array(file, size, path), path, path.name)
+    with parsing(path, "NPY"), open_bounded(path) as file:
+        columns = _columns(read_array(file, size, path), path, path.name)
     return cloud_of(columns, path)
 
 
@@ -117,11 +117,11 @@ def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path) -> Colu
             f"{path} is damaged: {info.filename} cannot unpack to {info.file_size} bytes"
         )
     with archive.open(info) as file:
-        return _read_array(io.BytesIO(file.read(info.file_size)), info.file_size, path)
+        return read_array(io.BytesIO(file.read(info.file_size)), info.file_size, path)
 
 
-def _read_array(file: BinaryIO, size: int, path: Path) -> Column:
-    """Return one array, once its header fits in `size` bytes."""
+def read_array(file: BinaryIO, size: int, path: Path) -> Column:
+    """Return one array of an NPY file, once its header fits in `size` bytes; no pickle."""
     version = np.lib.format.read_magic(file)
     if version == (1, 0):
         shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)

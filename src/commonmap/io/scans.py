@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from commonmap.errors import InputError
 from commonmap.io.atomic import writing_folder
-from commonmap.io.source import PathLike, look, parsing
+from commonmap.io.numpy_files import read_array
+from commonmap.io.source import PathLike, look, open_bounded, parsing
 from commonmap.types import Scan
 
 ENTRIES = ("times.txt", "velodyne", "time", "ring")
@@ -125,8 +126,10 @@ def read_scan(folder: Path, index: int, stamp: float) -> Scan:
 
 def _column(path: Path, dtype: np.dtype[Any], n: int) -> NDArray[Any]:
     with parsing(path, "NPY"):
-        # mapped, not loaded: a header that claims more than the file holds raises
-        array = np.load(path, mmap_mode="r", allow_pickle=False) if n else np.empty(0, dtype)
+        array = np.empty(0, dtype)
+        if n:
+            with open_bounded(path) as file:
+                array = read_array(file, path.stat().st_size, path)
         if array.shape != (n,) or array.dtype != dtype:
             raise InputError(
                 f"{path} must hold {n} values of {dtype}; {array.dtype} of shape {array.shape} came"
