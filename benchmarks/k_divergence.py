@@ -27,7 +27,13 @@ import scipy
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from commonmap.matching.correlate import PreparedTarget, Surface, prepare_target, score_half_turns
+from commonmap.matching.correlate import (
+    PreparedTarget,
+    Surface,
+    find_rim,
+    prepare_target,
+    score_half_turns,
+)
 
 CELL, BASE, DRAFT, TOP, FLOOR = 0.5, 400, 80, 1.0, 0.05
 Grid = tuple[NDArray[np.float64], NDArray[np.bool_]]
@@ -104,9 +110,11 @@ def run(
     del warm
 
     wall, cpu = time.perf_counter(), time.process_time()
+    rim = find_rim((known for _, known in half), (size, size), min_cells)
     prepared = prepare_target(
-        "k", *base, (size, size), height_range=(0.0, TOP), min_cells=min_cells, tolerance=tolerance
-    )
+        "k", *base, (size, size), height_range=(0.0, TOP), min_cells=min_cells, rim=rim,
+        tolerance=tolerance,
+    )  # fmt: skip
     poses, picked, worst = 0, 0, 0.0
     fft_wall, fft_cpu = time.perf_counter() - wall, time.process_time() - cpu
     direct_wall = direct_cpu = 0.0

@@ -172,8 +172,8 @@ def measure(side: float, threads: int) -> dict[str, Any]:
 
 
 def run(sides: list[float], threads: list[int]) -> None:
-    """Measure each size in its own process, and write the record as it goes."""
-    records = []
+    """Measure each size in its own process; it takes its place in the record as it comes."""
+    records = json.loads(RECORD.read_text())["records"] if RECORD.exists() else []
     for side in sides:
         for n in threads:
             command = [sys.executable, __file__, "one", str(side), str(n)]
@@ -181,8 +181,10 @@ def run(sides: list[float], threads: list[int]) -> None:
             pinned = ["taskset", "-c", cores, *command] if cores else command
             env = os.environ | {"OPENBLAS_NUM_THREADS": str(n)}
             told = subprocess.run(pinned, check=True, capture_output=True, text=True, env=env)
-            records.append(json.loads(told.stdout.splitlines()[-1]))
-            print(json.dumps(records[-1]), flush=True)
+            new = json.loads(told.stdout.splitlines()[-1])
+            records = [r for r in records if (r["side_m"], r["threads"]) != (side, n)] + [new]
+            records.sort(key=lambda r: (r["side_m"], r["threads"]))
+            print(json.dumps(new), flush=True)
             on = {"machine": platform.machine(), "cores": os.cpu_count(), "numpy": np.__version__}
             RECORD.write_text(json.dumps({"on": on, "records": records}, indent=1) + "\n")
 
@@ -210,7 +212,9 @@ def draw() -> None:
     left.set(xlabel="area of the base, hectares", ylabel="seconds", title=f"{most} threads")
     left.legend(fontsize=8)
     right.loglog(area, [r["peak_mb"] for r in rows], "o-", color="black", label="peak")
-    right.loglog(area, [r["held_before_mb"] for r in rows], "o-", color="grey", label="points, code")
+    right.loglog(
+        area, [r["held_before_mb"] for r in rows], "o-", color="grey", label="points, code"
+    )
     right.set(xlabel="area of the base, hectares", ylabel="MB", title="memory")
     right.legend(fontsize=8)
     figure.savefig(FIGURE, dpi=110)

@@ -13,6 +13,7 @@ import device_arrays
 from commonmap.errors import EmptyMapError, InputError, MissingExtraError
 from commonmap.matching import arrays
 from commonmap.matching.correlate import (
+    find_rim,
     prepare_target,
     score_half_turns,
     score_surface,
@@ -109,6 +110,35 @@ def test_shift_convention_literal() -> None:
     )
     assert whole.n_overlap[0].tolist() == [1, 2, 2, 2, 2, 2, 2, 1]
     assert whole.score[0, 0] == pytest.approx((height_s[2, 1] - height_t[0, 0]) ** 2, abs=1e-6)
+
+
+def test_a_known_rim_saves_transforms_and_no_pose_that_counts() -> None:
+    (height_s, known_s), (height_t, known_t) = make_maps(6, (21, 19), (40, 37))
+    known_s[:6], known_s[-5:], known_s[:, :4], known_s[:, -7:] = False, False, False, False
+    sources = [known_s, known_s[::-1, ::-1]]
+    rim = find_rim(sources, (21, 19), 40)
+    for axis in (0, 1):  # by hand: the most rows whose cells are fewer than 40, at either end
+        cells = np.count_nonzero(known_s, axis=1 - axis)
+        ends = [max(m for m in range(len(c)) if c[:m].sum() < 40) for c in (cells, cells[::-1])]
+        assert rim[axis] == min(ends) > 4
+    shape = (21, 19)
+    whole = prepare_target("k", height_t, known_t, shape, height_range=(0, TOP), min_cells=40)
+    small = prepare_target(
+        "k", height_t, known_t, shape, height_range=(0, TOP), min_cells=40, rim=rim
+    )
+    assert np.prod(small.frame.shape) < np.prod(whole.frame.shape)
+    for one, other in zip(
+        score_half_turns(whole, height_s, known_s), score_half_turns(small, height_s, known_s),
+        strict=True,
+    ):  # fmt: skip
+        counted = one.n_overlap >= 40
+        assert np.array_equal(~np.isnan(other.score), counted)
+        assert np.array_equal(other.n_overlap[counted], one.n_overlap[counted])
+        assert np.abs(one.score[counted] - other.score[counted]).max() < 5e-6
+    slow = direct_surface("k", height_s, known_s, height_t, known_t, min_cells=40)
+    assert np.nanmax(np.abs(score_surface(small, height_s, known_s).score - slow)) < 5e-6
+    with pytest.raises(InputError, match="outermost rows"):
+        score_surface(small, height_s, np.ones_like(known_s))
 
 
 def test_counts_are_exact_and_rim_may_wrap() -> None:

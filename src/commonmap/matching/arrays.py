@@ -55,18 +55,22 @@ def find_arrays(name: str) -> Arrays:
 
 
 def choose_shape(
-    target_shape: tuple[int, int], source_shape: tuple[int, int], min_cells: int
+    target_shape: tuple[int, int],
+    source_shape: tuple[int, int],
+    min_cells: int,
+    rim: tuple[int, int] = (0, 0),
 ) -> tuple[int, int]:
     """Return the size of the transforms, (Nx, Ny): no larger than the poses that count need.
 
     All shifts need `t + s - 1` per axis. Shifts at the rim, where the maps touch in so few
-    rows that fewer than `min_cells` cells can lie on each other, may wrap onto each other.
+    rows that fewer than `min_cells` cells can lie on each other, may wrap onto each other. rim: so
+    many rows and columns at each end of a source hold fewer than that.
     """
     lengths = []
     for axis in (0, 1):
         other = min(target_shape[1 - axis], source_shape[1 - axis])
         full = target_shape[axis] + source_shape[axis] - 1
-        spare = max(0, (min_cells - 1) // other)
+        spare = max(0, (min_cells - 1) // other, rim[axis])
         need = max(full - spare, target_shape[axis], source_shape[axis])
         lengths.append(int(scipy.fft.next_fast_len(need, real=axis == 1)))
     return lengths[0], lengths[1]

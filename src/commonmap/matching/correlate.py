@@ -133,6 +133,7 @@ def prepare_target(
     floor: float = 0.05,
     height_range: tuple[float, float] | None = None,
     min_cells: int = 1,
+    rim: tuple[int, int] = (0, 0),
     tolerance: float = 1e-6,
     classes: int | None = None,
     dtype: type[np.floating[Any]] = np.float32,
@@ -146,6 +147,7 @@ def prepare_target(
     height_range: metres, holds the heights of both maps; by default those of the target. Metrics
         whose plan expands or quantises heights refuse a source that leaves it.
     min_cells: poses with fewer cells known in both have no score.
+    rim: what `find_rim` says of the sources to come; it saves transforms of poses without a score.
     tolerance: of the expansion of a smooth metric, on shares that sum to one.
     classes: steps into which heights are cut, for the metrics that need it.
     dtype: float32 or float64, of the transforms. xp: "numpy" or "cupy".
@@ -173,7 +175,7 @@ def prepare_target(
     sx, sy = source_shape
     frame = Frame(
         find_arrays(xp),
-        choose_shape((tx, ty), (sx, sy), min_cells),
+        choose_shape((tx, ty), (sx, sy), min_cells, rim),
         (sx, sy),
         (tx + sx - 1, ty + sy - 1),
         dtype,
@@ -231,7 +233,38 @@ def _source_heights(
             height = prepared.classes.steps.snap(height)
     height = np.where(known, height - prepared.offset, 0.0)
     pad = ((0, sx - raw.shape[0]), (0, sy - raw.shape[1]))
-    return np.pad(height, pad), np.pad(known, pad)
+    known = np.pad(known, pad)
+    frame = prepared.frame
+    for axis in (0, 1):
+        told_apart = frame.out_shape[axis] - frame.shape[axis]
+        if _rim_of(known, axis, prepared.min_cells) < told_apart:
+            raise InputError(
+                f"the target was prepared for sources with fewer than {prepared.min_cells} known "
+                f"cells in the {told_apart} outermost rows; this one has more"
+            )
+    return np.pad(height, pad), known
+
+
+def find_rim(
+    sources: Iterable[Bools], source_shape: tuple[int, int], min_cells: int
+) -> tuple[int, int]:
+    """Return how many rows and columns at each end of all sources hold too few cells for a pose.
+
+    sources: known masks (sx, sy) or smaller, as they will be scored, of `source_shape` padded.
+    """
+    rims = list(source_shape)
+    for known in sources:
+        pad = [(0, n - m) for n, m in zip(source_shape, known.shape, strict=True)]
+        padded = np.pad(known, pad)
+        rims = [min(rims[axis], _rim_of(padded, axis, min_cells)) for axis in (0, 1)]
+    return rims[0], rims[1]
+
+
+def _rim_of(known: Bools, axis: int, min_cells: int) -> int:
+    """Return how many rows (axis 0) or columns at either end hold fewer than `min_cells` cells."""
+    cells = np.count_nonzero(known, axis=1 - axis)
+    ends = (np.searchsorted(np.cumsum(some), min_cells) for some in (cells, cells[::-1]))
+    return int(min(ends))
 
 
 def _count(

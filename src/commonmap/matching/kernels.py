@@ -118,6 +118,9 @@ def _evaluate_compiled(
     b1, b2 = np.empty(width, values.dtype), np.empty(width, values.dtype)
     two = x.dtype.type(2.0)
     for i in range(A.shape[0]):
+        if not counted[i].any():
+            out[i] = np.nan
+            continue
         if half > 0.0:
             for j in range(width):
                 x[j] = min(1.0, max(-1.0, (g[i, j] - middle) / half))

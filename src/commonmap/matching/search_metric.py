@@ -69,6 +69,12 @@ def search_metric(
     low = np.full(2, -0.5 * side * cell)
     _, known_0 = scatter_heights(xy, height, 1.0, 0.0, cell, low, side, side)
     n_known = int(np.count_nonzero(known_0))
+    yaws = 2.0 * np.pi * np.arange(n_yaw) / n_yaw
+    min_cells = max(4, int(min_overlap * n_known))
+    turned = (
+        scatter_heights(xy, height, float(np.cos(t)), float(np.sin(t)), cell, low, side, side)[1]
+        for t in yaws
+    )
     prepared = correlate.prepare_target(
         row,
         height_t,
@@ -77,7 +83,8 @@ def search_metric(
         normalise=normalise if normalise in row.normalisations else row.normalisations[0],
         floor=floor,
         height_range=(0.0, float(max(height.max(), t_height.max(), floor))),
-        min_cells=max(4, int(min_overlap * n_known)),
+        min_cells=min_cells,
+        rim=correlate.find_rim(turned, (side, side), min_cells),
         xp=arrays,
         workers=1,
     )
@@ -85,7 +92,6 @@ def search_metric(
         _search_yaw, prepared=prepared, xy=xy, height=height, cell=cell, low=low, side=side,
         origin=low_t,
     )  # fmt: skip
-    yaws = 2.0 * np.pi * np.arange(n_yaw) / n_yaw
     found = []
     with ThreadPoolExecutor(max_workers=workers) as pool:
         for n, peaks in enumerate(pool.map(one, yaws)):
