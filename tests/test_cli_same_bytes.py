@@ -27,7 +27,8 @@ main()
 def answer_of(base: Path, draft: Path, out: Path, threads: int) -> bytes:
     """Return match.json without its timings, every number with all its digits."""
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
-    command = [sys.executable, "-c", MATCH, str(threads), "match", base, draft, "-o", out, "-q"]
+    words = ["match", str(base), str(draft), "-o", str(out), "-q"]
+    command = [sys.executable, "-c", MATCH, str(threads), *words]
     done = subprocess.run(
         command, env=os.environ | {name: str(threads) for name in names}, capture_output=True
     )
