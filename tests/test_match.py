@@ -326,11 +326,11 @@ def test_halves_that_fall_apart_and_ground_that_differs_lower_the_confidence(
 
 def test_the_halves_of_a_lucky_overlap_turn_the_verdict() -> None:
     doubtful = replace(
-        figures_of_a_good_match(), decoy_ratio=2.0, second_ratio=1.8, prominence=7.0,
+        figures_of_a_good_match(), decoy_ratio=3.0, second_ratio=2.5, prominence=15.0,
         inliers=0.6, decoy_inliers=0.3,
     )  # fmt: skip
     assert is_open(doubtful)
-    assert decide(replace(doubtful, half_1=2.5, half_2=2.0)).accepted
+    assert decide(replace(doubtful, half_1=3.0, half_2=2.5)).accepted
     apart = decide(replace(doubtful, half_1=1.3, half_2=0.4))
     assert not apart.accepted
     assert "half" in apart.reason

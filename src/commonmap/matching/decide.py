@@ -3,7 +3,7 @@
 The figures compare the best pose with what chance reaches in the very same maps: the best pose of
 the mirrored source (the decoy), the best pose elsewhere (the second), the best poses of all other
 headings; and with how the points lie on each other at the decoy's pose. A logistic model, fitted to
-simulated pairs of many kinds (`benchmarks/decision.py`, docs/decision.md), makes one probability of
+simulated pairs of many kinds (`benchmarks/decision.py`, docs/matching.md), makes one probability of
 them. Two things no probability makes up for: a refinement that left the peak, and too little
 evidence to fix a pose.
 """
@@ -83,13 +83,13 @@ LEAST_EVIDENCE = 100.0
 independent tenth of it is left, which chance among a million poses reaches once in a while."""
 
 WEIGHTS = {
-    "bias": -7.16, "ratios": 1.92, "prominence": 1.16, "inliers": 2.18, "ground": 1.96,
-    "halves": 3.55,
+    "bias": -9.01, "ratios": 1.9, "prominence": 1.62, "inliers": 0.74, "ground": 1.88,
+    "halves": 1.81,
 }  # fmt: skip
 """Of the logistic model; see `features`."""
 
 QUICK_WEIGHTS = {
-    "bias": -10.17, "ratios": 3.79, "prominence": 2.08, "inliers": 4.37, "ground": 2.05,
+    "bias": -11.48, "ratios": 2.57, "prominence": 1.78, "inliers": 1.12, "ground": 2.65,
 }  # fmt: skip
 """Of the model without the halves, which decides where it is sure."""
 
