@@ -29,12 +29,16 @@ from commonmap.odometry.motion import (
     sweep_motion,
 )
 from commonmap.odometry.solve import (
+    NOTHING,
+    Prior,
     Rows,
     bisquare,
     find_openness,
     levenberg_marquardt_step,
     minimise,
     normal_equations,
+    pretended,
+    settle,
 )
 from commonmap.sim.scanning import firing_pattern
 from commonmap.sim.vlp16 import VLP16
@@ -312,6 +316,62 @@ def test_degenerate_directions_are_found_and_left_alone(axes: str, open_axes: se
             assert value == pytest.approx(T_to_motion(T0)[axis], abs=0.05)
         else:
             assert value == pytest.approx(0.0, abs=0.02)
+
+
+def test_what_the_noise_of_normals_pretends_equals_its_slow_twin() -> None:
+    rng = np.random.default_rng(6)
+    rows = box(rng, "xyz", 20)
+    anchors = rows.c + rng.normal(size=rows.c.shape)
+    w, tilt = rng.uniform(0, 2, len(rows)), rng.uniform(0, 1, len(rows))
+    T = motion_to_T(rng.normal(size=6) * 0.3)
+    R, t = np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy()
+    H, g, cost = np.zeros((6, 6)), np.zeros(6), 0.0
+    for p, c, u, s in zip(rows.p, anchors, rows.u, w * tilt, strict=True):
+        A = np.vstack([np.eye(3), np.cross(p, np.eye(3)).T])
+        v, off = R.T @ u, R.T @ (R @ p + t - c)
+        within = np.eye(3) - np.outer(v, v)
+        H += s * A @ within @ A.T
+        g += s * A @ within @ off
+        cost += s * off @ within @ off
+    found = pretended(R, t, rows.p, anchors, rows.u, w, tilt)
+    assert found[0] == pytest.approx(H, rel=1e-9, abs=1e-9)
+    assert found[1] == pytest.approx(g, rel=1e-9, abs=1e-9)
+    assert found[2] == pytest.approx(cost)
+
+
+def test_noisy_normals_do_not_hold_the_sensor_back() -> None:
+    """Where the map lags behind, noise of its normals must not make a moving robot stand still."""
+    rng = np.random.default_rng(9)
+    n, noise = 4000, 0.05
+    anchors = np.column_stack([rng.uniform(-10, 10, (n, 2)), np.zeros(n)])
+    slope = 0.08 * rng.normal(size=(n, 2))  # a rolling field
+    true, seen = (
+        np.column_stack([s, np.ones(n)]) for s in (slope, slope + noise * rng.normal(size=(n, 2)))
+    )
+    p = anchors.copy()
+    p[:, 2] = -0.3 * true[:, 0]  # 0.3 m ahead along x they lie on the true planes
+    normals = seen / np.linalg.norm(seen, axis=1)[:, None]
+    rows = Rows(p, anchors, normals, np.full(n, 0.02), np.full(n, noise**2), np.arange(n))
+    x = []
+    for correct in (True, False):
+        T, _, _ = settle(np.eye(4), rows, None, NOTHING, lever=5.0, tolerance=0.5, correct=correct)
+        x.append(T[0, 3])
+    assert x[0] == pytest.approx(0.3, abs=0.03)
+    assert x[1] < 0.25
+
+
+def test_a_prior_gives_what_the_scene_does_not_hold() -> None:
+    rng = np.random.default_rng(3)
+    rows = box(rng, "z")
+    T_prior = motion_to_T(np.array([0.5, 0.4, 0.1, 0.0, 0.0, 0.1]))
+    prior = Prior(T_prior, np.full(6, 100.0))
+    T = np.eye(4)
+    for _ in range(5):
+        T, open_, _ = settle(T, rows, None, prior, lever=5.0, tolerance=0.5)
+    assert len(open_.directions) == 3
+    x, y, z, _, _, yaw = T_to_motion(T)
+    assert (x, y, yaw) == pytest.approx((0.5, 0.4, 0.1), abs=0.05)
+    assert abs(z) < 0.02
 
 
 def test_bisquare_gives_outliers_no_weight() -> None:

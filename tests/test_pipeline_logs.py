@@ -17,7 +17,7 @@ from commonmap.demo import run_demo
 from commonmap.errors import InputError
 from commonmap.frames import angle, from_xyz_yaw, invert
 from commonmap.io.logs.poses import interpolate
-from commonmap.odometry import Odometry, compare, estimate
+from commonmap.odometry import Odometry, ScanHealth, compare, estimate, find_sound_part
 from commonmap.pipeline_logs import describe_robot, map_log
 from commonmap.sim.missions import Area, Mission, drive, fly
 from commonmap.sim.recording import fit_truth, record
@@ -131,6 +131,35 @@ def test_turns_that_are_lost_are_not_in_the_map_and_trouble_is_told(troubled: An
     assert (values["turns_lost"], values["turns_degenerate"]) == (3, 10)
     assert [t["kind"] for t in values["troubles"]] == ["lost", "degenerate"]
     assert values["troubles"][0]["begin"] == pytest.approx(0.65, abs=0.03)
+
+
+def test_of_a_log_that_was_lost_for_long_the_longest_part_is_mapped(troubled: Any) -> None:
+    scans, _ = recorded("ugv", 8.0)
+    troubled(lost=range(12, 18), open_=range(0))
+    made = map_log(lambda: iter(scans[:40]))
+    assert made.sound == range(18, 40)
+    assert made.n_left_out == 18
+    assert made.cloud.time is not None
+    assert made.cloud.time.min() >= scans[18].time.min()
+    assert any("longest part" in note and "22 of 40 turns" in note for note in made.notes)
+    moments = [h.moment for h in made.odometry.health]
+    assert describe_robot(made)["mapped"] == [moments[18], moments[39]]
+
+
+def test_the_sound_part_in_numbers() -> None:
+    none = np.zeros((0, 6))
+
+    def part(pattern: str) -> range:
+        return find_sound_part(
+            [ScanHealth(0.1 * k, 99, 0.9, 0.02, none, c == "x") for k, c in enumerate(pattern)]
+        )
+
+    assert part("........") == range(0, 8)
+    assert part("...xxxx...") == range(0, 10)  # too short a guess to part them
+    assert part("...xxxxx....") == range(8, 12)
+    assert part("xx....xxxxx...") == range(2, 6)
+    assert part("...x...xxxxx..") == range(0, 7)
+    assert part("xxxxxx") == range(0)
 
 
 def test_a_log_that_is_mostly_lost_gives_no_map(troubled: Any) -> None:

@@ -24,6 +24,7 @@ from commonmap.odometry import (
     covers,
     describe_health,
     estimate,
+    find_sound_part,
     find_troubles,
     georeference,
 )
@@ -42,11 +43,13 @@ class RobotMap:
     """What a robot's log became.
 
     cloud: deskewed, thinned, with time and ray origins, in the frame of the map: level, z up, its
-    origin where the sensor was at first (of known poses: in the frame of the poses).
+    origin where the sensor was at first (of known poses: in the frame of the poses). Where odometry
+    was lost for long, the cloud is of the longest part of the log before or after.
     trajectory: of the sensor in the same frame. odometry: the answer as estimated, its health in
     the frame of the map. levelling: how the first sensor frame was turned. voxel: metres, of the
     thinning. n_turns: of the log. n_left_out: turns that are not in the cloud, since their pose is
-    a guess or not known. notes: sentences for the user.
+    a guess or not known. notes: sentences for the user. sound: the turns of the part that is mapped
+    (with odometry).
     """
 
     cloud: Cloud
@@ -57,6 +60,7 @@ class RobotMap:
     n_turns: int
     n_left_out: int
     notes: tuple[str, ...]
+    sound: range = range(0)
 
     @property
     def troubles(self) -> tuple[Trouble, ...]:
@@ -106,13 +110,13 @@ def map_log(
     progress(f"level the map of {name}")
     levelling = no_levelling("the frame is that of the known poses")
     if method != "poses":
-        levelling = level_log(cloud, answer.trajectory, acceleration)
+        levelling = level_log(cloud, counted.sound_way, acceleration)
     T = levelling.T_level_map
     answer = _turned(answer, T)
-    notes = _notes(answer, levelling, counted.n_left_out)
+    notes = _notes(answer, levelling, counted)
     return RobotMap(
         move_cloud(T, cloud), answer.trajectory, answer, levelling, gathered.voxel,
-        counted.n, counted.n_left_out, notes,
+        counted.n, counted.n_left_out, notes, counted.sound,
     )  # fmt: skip
 
 
@@ -142,6 +146,9 @@ def describe_robot(robot: RobotMap, errors: TrajectoryErrors | None = None) -> d
         "turns_lost": robot.odometry.n_lost,
         "turns_degenerate": robot.odometry.n_degenerate,
         "turns_left_out": robot.n_left_out,
+        "mapped": [health[k].moment for k in (robot.sound.start, robot.sound.stop - 1)]
+        if robot.sound
+        else None,
         "median_residual": float(np.nanmedian([h.residual for h in health]))
         if any(np.isfinite(h.residual) for h in health)
         else None,
@@ -183,18 +190,34 @@ def _telling(
 
 
 class _Counter:
-    """Passes on the turns whose pose is known, and counts all and the others."""
+    """Passes on the turns whose pose is known, and counts all and the others.
+
+    Turns before and after the longest part that holds together are left out too: how they lie to
+    it is a guess (`n_apart`).
+    """
 
     def __init__(self, answer: Odometry):
-        self.n = self.n_left_out = 0
+        self.n = self.n_left_out = self.n_apart = 0
         self._trajectory = answer.trajectory
         self._lost = [h.lost for h in answer.health]
+        self.sound = find_sound_part(answer.health)
+
+    @property
+    def sound_way(self) -> Trajectory:
+        """The poses of the part that is mapped."""
+        if not self._lost:
+            return self._trajectory
+        part = slice(self.sound.start, self.sound.stop)
+        return Trajectory(self._trajectory.time[part], self._trajectory.T_map_sensor[part])
 
     def placeable(self, scans: Iterable[Scan]) -> Iterator[Scan]:
         for scan in scans:
-            lost = self.n < len(self._lost) and self._lost[self.n]
+            known = self.n < len(self._lost)
+            lost = known and self._lost[self.n]
+            apart = known and not lost and self.n not in self.sound
             self.n += 1
-            if lost or not covers(self._trajectory, scan):
+            self.n_apart += apart
+            if lost or apart or not covers(self._trajectory, scan):
                 self.n_left_out += 1
             else:
                 yield scan
@@ -216,10 +239,22 @@ def _turned(answer: Odometry, T: Float64s) -> Odometry:
     return Odometry(answer.method, move_trajectory(T, answer.trajectory), health, notes)
 
 
-def _notes(answer: Odometry, levelling: Levelling, n_left_out: int) -> tuple[str, ...]:
+def _notes(answer: Odometry, levelling: Levelling, counted: _Counter) -> tuple[str, ...]:
     notes = [*answer.notes]
-    if n_left_out:
-        notes.append(f"{n_left_out} turns whose poses are not known are left out of the map")
+    if counted.n_apart:
+        way = counted.sound_way.time
+        notes.append(
+            f"odometry was lost for too long to know how the parts of the log lie to each other: "
+            f"the map is of its longest part, {way[0]:.2f} to {way[-1]:.2f} s "
+            f"({len(counted.sound)} of {counted.n} turns)"
+        )
+    if counted.n_left_out - counted.n_apart:
+        n = counted.n_left_out - counted.n_apart
+        notes.append(f"{n} turns whose poses are not known are left out of the map")
+    if answer.n_degenerate or answer.n_lost:
+        notes.append(
+            "the map may be bent where the scene did not hold the pose; see the times told"
+        )
     if answer.method != "poses":
         notes.append(f"the map was {levelling.reason}" if levelling.tilt else levelling.reason)
     return tuple(notes)

@@ -10,6 +10,7 @@ from commonmap.odometry.table import (
     OdometryMethod,
     describe_health,
     estimate,
+    find_sound_part,
     find_troubles,
 )
 
@@ -26,6 +27,7 @@ __all__ = [
     "covers",
     "describe_health",
     "estimate",
+    "find_sound_part",
     "find_troubles",
     "georeference",
 ]

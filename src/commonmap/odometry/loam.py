@@ -25,12 +25,18 @@ from commonmap.odometry.motion import (
 )
 from commonmap.odometry.records import ScanHealth
 from commonmap.odometry.scan_match import RingedPoints, by_ring, match_scan
-from commonmap.odometry.solve import Openness, Rows, residuals, settle
+from commonmap.odometry.solve import NOTHING, Openness, Prior, Rows, residuals, settle
 from commonmap.odometry.turn import Turn, arrange, select
 from commonmap.types import Float64s, Scan
 
 STILL = np.zeros(6)
 STAY = np.eye(4)
+
+LEAST_CHANGE = np.array([0.02, 0.02, 0.02, 0.005, 0.005, 0.005])
+FIRST_CHANGE = np.array([0.15, 0.15, 0.15, 0.03, 0.03, 0.03])
+"""Metres and radians by which the motion of one turn differs from that of the turn before, for
+turns of 0.1 s: the least that is believed, and what is believed before any is seen. The prior is no
+surer than that; it matters only where the scene says nearly nothing."""
 
 WHOLE = 10
 """The first turns enter the map whole, of later ones every other planar point: most would fall into
@@ -86,6 +92,17 @@ class Taken:
     smooth_ring: NDArray[np.int64]
 
 
+@dataclass(frozen=True, eq=False)
+class Registered:
+    """A pose found in the map. T: (4, 4), T_map_turn. rows: the constraints at it. directions:
+    (K, 6) as in `Openness`. n_matched: rows that count."""
+
+    T: Float64s
+    rows: Rows
+    directions: Float64s
+    n_matched: int
+
+
 class Loam:
     """The state of the odometry. Feed turns in order of time with `add`.
 
@@ -101,6 +118,7 @@ class Loam:
         self._rate: Float64s = STILL  # motion per second of the last turn, its own frame
         self._deskew_rate_last: Float64s = STILL
         self._stamp = 0.0
+        self._change = FIRST_CHANGE  # see there; running mean
         self._share = 0.0  # of features that match, running mean of the turns that were not lost
         self._cell = 0.0
         self._cropped: Float64s = np.zeros(3)
@@ -162,6 +180,19 @@ class Loam:
         rate, _ = sweep_motion(motion_between(T_map_turn, last), dt)
         return rate
 
+    def _foresee(self, dt: float) -> Prior:
+        """Return where the motion of the turns before leads from the last pose, and how sure that
+        is: from how much the motion changed between turns so far."""
+        if len(self.poses) < 3:
+            return NOTHING
+        spread = np.maximum(self._change, LEAST_CHANGE) * max(dt / 0.1, 1.0) ** 2
+        return Prior(motion_to_T(self._rate * dt), 1.0 / spread**2)
+
+    def _learn(self, off: Float64s) -> None:
+        """Take in by how much a motion differed from what was foreseen, (6,)."""
+        square = np.minimum(off, 3.0 * self._change) ** 2
+        self._change = np.sqrt(0.95 * self._change**2 + 0.05 * square)
+
     def _unskew(
         self, points: Float64s, delay: Float64s, rate: Float64s, bend: Float64s
     ) -> Float64s:
@@ -174,6 +205,7 @@ class Loam:
         assert self._last is not None
         o, first, rate = self.options, len(self.poses) == 1, self._rate
         rounds = 8 if first else o.scan_rounds
+        prior = self._foresee(dt)
         points = np.concatenate([taken.sharp, taken.flat])
         delay = np.concatenate([taken.sharp_delay, taken.flat_delay])
         ring = np.concatenate([taken.sharp_ring, taken.flat_ring])
@@ -188,7 +220,9 @@ class Loam:
             rows = match_scan(here, ring, len(taken.sharp), T, *before, reach)
             if len(rows) < 20:
                 break
-            T_new, _, _ = settle(T, rows, None, lever=self.lever, tolerance=o.tolerance)
+            T_new, _, _ = settle(
+                T, rows, None, prior, lever=self.lever, tolerance=o.tolerance, correct=not first
+            )
             step = self._moved(T, T_new)
             T = T_new
             new_rate, _ = sweep_motion(motion_between(T, STAY), dt)
@@ -213,48 +247,62 @@ class Loam:
 
     def _match_map(self, taken: Taken, T: Float64s, dt: float) -> tuple[Float64s, ScanHealth]:
         """Return T_map_turn and how well it is known (section VI of LOAM)."""
-        o = self.options
         chosen = thin(taken.smooth, self._cell)
-        growth = np.sqrt(max(len(chosen), 1) / o.n_planar)
+        growth = np.sqrt(max(len(chosen), 1) / self.options.n_planar)
         self._cell = float(np.clip(self._cell * growth, 0.5 * self.voxel, 6.0 * self.voxel))
         points = np.concatenate([taken.smooth[chosen], taken.edge])
         delay = np.concatenate([taken.smooth_delay[chosen], taken.edge_delay])
-        T_guess, w = T, np.zeros(0)
+        prior = self._foresee(dt)
+        ahead = Prior(self.poses[-1] @ prior.T, prior.information)
+        found = self._register(points, delay, len(chosen), T, ahead, dt)
+        # a map of two or three turns is thin: that few features find a plane there is no trouble
+        usual = max(LEAST_SHARE, FALL * self._share) if len(self.poses) >= 5 else 0.0
+        enough = max(LEAST_MATCHED, usual * len(points))
+        if found.n_matched < enough:  # the scans agree on a way that the map does not know: others?
+            for start in (ahead.T, self.poses[-1]):
+                other = self._register(points, delay, len(chosen), start, ahead, dt)
+                found = other if other.n_matched > found.n_matched else found
+        lost = found.n_matched < enough
+        share = min(found.n_matched / max(len(points), 1), 1.0)
+        if not lost:
+            self._share += 0.1 * (share - self._share) if self._share else share
+            T = found.T
+            if prior is not NOTHING and not len(found.directions):
+                self._learn(np.abs(motion_between(ahead.T, T)))
+        self._deskew_rate_last = sweep_motion(motion_between(T, self.poses[-1]), dt)[0]
+        R = np.ascontiguousarray(found.T[:3, :3])
+        degenerate = np.hstack([found.directions[:, :3] @ R.T, found.directions[:, 3:] @ R.T])
+        residual, rows = float("nan"), found.rows
+        if len(rows):
+            d = residuals(R, found.T[:3, 3].copy(), rows.p, rows.c, rows.u)
+            residual = 1.4826 * float(np.median(np.abs(d)))
+        moment = taken.turn.moment
+        return T, ScanHealth(moment, found.n_matched, share, residual, degenerate, lost)
+
+    def _register(
+        self, points: Float64s, delay: Float64s, n_planar: int, T: Float64s, prior: Prior, dt: float
+    ) -> Registered:
+        """Return the pose to which rounds of matching to the map lead from T."""
+        o, w, rows = self.options, np.zeros(0), Rows.room(0)
         open_: Openness | None = None
-        rows = Rows.room(0)
         asked: Float64s | None = None  # the pose at which the map was asked for partners
         for _ in range(o.map_rounds):
             rate, _ = sweep_motion(motion_between(T, self.poses[-1]), dt)
             here = self._unskew(points, delay, rate, STILL)
             if asked is None or self._moved(asked, T) > 0.2 * self.voxel:
-                rows = match_map(here, len(chosen), T, self.fine, self.coarse, self.edges)
+                rows = match_map(here, n_planar, T, self.fine, self.coarse, self.edges)
                 asked, open_ = T, None
             else:
                 rows = rows.refresh(here)
             if len(rows) < LEAST_MATCHED:
                 break
-            T_new, open_, w = settle(T, rows, open_, lever=self.lever, tolerance=o.tolerance)
+            T_new, open_, w = settle(T, rows, open_, prior, lever=self.lever, tolerance=o.tolerance)
             step = self._moved(T, T_new)
             T = T_new
             if step < 0.01 * self.voxel:
                 break
-        self._deskew_rate_last = sweep_motion(motion_between(T, self.poses[-1]), dt)[0]
-        n_matched = int((w > 0).sum())
-        share = min(n_matched / max(len(points), 1), 1.0)
-        # a map of two or three turns is thin: that few features find a plane there is no trouble
-        usual = max(LEAST_SHARE, FALL * self._share) if len(self.poses) >= 5 else 0.0
-        lost = n_matched < LEAST_MATCHED or share < usual
-        if not lost:
-            self._share += 0.1 * (share - self._share) if self._share else share
-        R = T[:3, :3]
-        degenerate = np.zeros((0, 6)) if open_ is None else open_.directions
-        degenerate = np.hstack([degenerate[:, :3] @ R.T, degenerate[:, 3:] @ R.T])
-        residual = float("nan")
-        if len(rows):
-            d = residuals(np.ascontiguousarray(R), T[:3, 3].copy(), rows.p, rows.c, rows.u)
-            residual = 1.4826 * float(np.median(np.abs(d)))
-        health = ScanHealth(taken.turn.moment, n_matched, share, residual, degenerate, lost)
-        return (T_guess if lost else T), health
+        directions = np.zeros((0, 6)) if open_ is None else open_.directions
+        return Registered(T, rows, directions, int((w > 0).sum()))
 
     def _moved(self, T: Float64s, T_new: Float64s) -> float:
         """Return how far the scene moves between two poses, metres: shift and turn together."""

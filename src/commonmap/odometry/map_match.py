@@ -17,6 +17,9 @@ WIDTH = 0.28
 """A plane's points spread at least so much of a voxel across their longest direction, standard
 deviation (a disc of one voxel's radius: 0.5)."""
 
+ROUGH = 1.3
+"""A plane's points spread at least so many times more within it than across it, in variance."""
+
 
 def match_map(
     points: Float64s, n_planar: int, T: Float64s, fine: LocalMap, coarse: LocalMap, edges: LocalMap
@@ -116,10 +119,11 @@ def _planes(  # type: ignore[no-untyped-def]
                 continue
             eigen3(S, lam, V)
             low = max(lam[0], 0.0) * m / (m - 3.0)
-            # a plane: wide both ways, and thin; one ring with the noise of its ranges is a
-            # false plane, spanned by the ring and the beam, that would hold the sensor back
+            # a plane: wide both ways; one ring with the noise of its ranges is a false plane,
+            # spanned by the ring and the beam, that would hold the sensor back. A rough one, as of
+            # a canopy, counts for what its roughness leaves
             wide = WIDTH * (edge if level == 0 else edge2)
-            if lam[1] > wide * wide and lam[1] > 0.05 * lam[2] and lam[1] > 5.0 * low:
+            if lam[1] > wide * wide and lam[1] > 0.05 * lam[2] and lam[1] > ROUGH * low:
                 found = True
                 break
         if not found:

@@ -14,7 +14,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from commonmap.odometry.motion import rotate
+from commonmap.odometry.motion import motion_between, rotate
 from commonmap.types import Float64s
 
 PRETENDED = 1.25
@@ -67,7 +67,8 @@ class Openness:
     """What the constraints determine (Zhang, Kaess and Singh 2016, ICRA, "On degeneracy of
     optimization-based state estimation problems").
 
-    P: (6, 6) takes a step `[t, theta]` (turn's frame) to its part along determined directions.
+    P: (6, 6) takes a step `[t, theta]` (turn's frame) to its part along directions of which the
+        constraints say anything.
     directions: (K, 6) degenerate directions, unit vectors with theta times `lever`, turn's frame.
     lever: metres, the length that makes angles comparable with shifts.
     """
@@ -125,33 +126,51 @@ def normal_equations(
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def pretended(R: Float64s, p: Float64s, u: Float64s, w: Float64s, tilt: Float64s) -> Float64s:
-    """Return the part of J^T J that only the noise of the normals gives, (6, 6).
+def pretended(
+    R: Float64s, t: Float64s, p: Float64s, c: Float64s, u: Float64s, w: Float64s, tilt: Float64s
+) -> tuple[Float64s, Float64s, float]:
+    """Return the parts of J^T J, J^T d and d^T d that only the noise of the normals gives.
 
     A normal that is off by a small angle of variance `tilt` across itself adds
-    `tilt A (I - u u^T) A^T` with A = [I; [p]x]: on a flat field this is all there is of x, y, yaw.
+    `tilt A (I - u u^T) A^T` with A = [I; [p]x], and draws the point p to its anchor c within the
+    plane: on a flat field this is all there is of x, y, yaw, and it holds the sensor back, since
+    the map ends where the sensor has not been yet.
     """
-    H = np.zeros((6, 6))
-    row = np.empty(6)
+    H, g, cost = np.zeros((6, 6)), np.zeros(6), 0.0
+    row, f = np.empty(6), np.empty(3)
     n = x = y = z = xx = yy = zz = xy = xz = yz = 0.0
     for i in range(p.shape[0]):
         s = w[i] * tilt[i]
         if s <= 0.0:
             continue
         # A A^T: the three axes
-        a, b, c = p[i, 0], p[i, 1], p[i, 2]
+        a, b, h = p[i, 0], p[i, 1], p[i, 2]
         n += s
-        x, y, z = x + s * a, y + s * b, z + s * c
-        xx, yy, zz = xx + s * a * a, yy + s * b * b, zz + s * c * c
-        xy, xz, yz = xy + s * a * b, xz + s * a * c, yz + s * b * c
+        x, y, z = x + s * a, y + s * b, z + s * h
+        xx, yy, zz = xx + s * a * a, yy + s * b * b, zz + s * h * h
+        xy, xz, yz = xy + s * a * b, xz + s * a * h, yz + s * b * h
         # less that along the normal itself
+        d = square = 0.0
+        f[0] = f[1] = f[2] = 0.0
         for r in range(3):
             row[r] = R[0, r] * u[i, 0] + R[1, r] * u[i, 1] + R[2, r] * u[i, 2]
-        row[3], row[4] = b * row[2] - c * row[1], c * row[0] - a * row[2]
+            off = R[r, 0] * a + R[r, 1] * b + R[r, 2] * h + t[r] - c[i, r]
+            d += u[i, r] * off
+            square += off * off
+            for k in range(3):
+                f[k] += R[r, k] * off
+        row[3], row[4] = b * row[2] - h * row[1], h * row[0] - a * row[2]
         row[5] = a * row[1] - b * row[0]
         for j in range(6):
             for k in range(j + 1):
                 H[j, k] -= s * row[j] * row[k]
+        for k in range(3):
+            f[k] = s * (f[k] - d * row[k])
+            g[k] += f[k]
+        g[3] += b * f[2] - h * f[1]
+        g[4] += h * f[0] - a * f[2]
+        g[5] += a * f[1] - b * f[0]
+        cost += s * (square - d * d)
     H[0, 0], H[1, 1], H[2, 2] = H[0, 0] + n, H[1, 1] + n, H[2, 2] + n
     H[3, 1], H[3, 2] = H[3, 1] - z, H[3, 2] + y
     H[4, 0], H[4, 2] = H[4, 0] + z, H[4, 2] - x
@@ -161,7 +180,7 @@ def pretended(R: Float64s, p: Float64s, u: Float64s, w: Float64s, tilt: Float64s
     for j in range(6):
         for k in range(j):
             H[k, j] = H[j, k]
-    return H
+    return H, g, cost
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -218,11 +237,12 @@ def find_openness(
     """Return which directions of motion the constraints leave open.
 
     A direction is degenerate where its information (an eigenvalue of J^T J, angles scaled by the
-    lever) is not clearly above what the noise of the normals pretends, or where it would leave the
-    pose uncertain by more than `tolerance` metres. w: weights per metre squared.
+    lever) is not clearly above what the noise of the normals pretends, or where what is above would
+    leave the pose uncertain by more than `tolerance` metres. Steps are taken along the latter, for
+    what they are worth beside a prior. w: weights per metre squared.
     """
     H, _, _ = normal_equations(R, np.zeros(3), rows.p, rows.c, rows.u, w)
-    noise = pretended(R, rows.p, rows.u, w, rows.tilt)
+    noise, _, _ = pretended(R, np.zeros(3), rows.p, rows.c, rows.u, w, rows.tilt)
     return Openness(*_openness(H, noise, lever, tolerance), lever)
 
 
@@ -239,13 +259,29 @@ def _openness(
     n = 0
     for k in range(6):
         v = V[:, k].copy()
-        if values[k] > PRETENDED * (v @ (noise @ v)) and values[k] > 1.0 / tolerance**2:
+        floor = v @ (noise @ v)
+        if values[k] > PRETENDED * floor:
             kept += v.reshape(6, 1) * v
-        else:
+        if values[k] <= PRETENDED * floor or values[k] - floor <= 1.0 / tolerance**2:
             open_[n] = v
             n += 1
     # V_u V^-1 of the paper: a step's parts along open directions are left out
     return scale.reshape(6, 1) * kept / scale, open_[:n].copy()
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """What is known of a pose before the scene is asked.
+
+    T: (4, 4), where the motion so far leads. information: (6,) of `[t, theta]` of the turn's frame,
+    per metre squared and per radian squared; zeros where nothing is known.
+    """
+
+    T: Float64s
+    information: Float64s
+
+
+NOTHING = Prior(np.eye(4), np.zeros(6))
 
 
 def minimise(
@@ -253,64 +289,101 @@ def minimise(
 ) -> Float64s:
     """Return the pose (4, 4) after Levenberg-Marquardt from `T` with fixed rows and weights."""
     P = np.eye(6) if openness is None else openness.P
-    H, g, cost = normal_equations(_R(T), T[:3, 3].copy(), rows.p, rows.c, rows.u, w)
-    moved: Float64s = _minimise(T, rows.p, rows.c, rows.u, w, P, H, g, cost, iterations)
+    moved: Float64s = _minimise(
+        T, rows.p, rows.c, rows.u, w, np.zeros(len(rows)), P, NOTHING.T, NOTHING.information,
+        iterations,
+    )  # fmt: skip
     return moved
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _equations(
+    T: Float64s, p: Float64s, c: Float64s, u: Float64s, w: Float64s, tilt: Float64s, P: Float64s,
+    T_prior: Float64s, information: Float64s,
+) -> tuple[Float64s, Float64s, float]:  # fmt: skip
+    """Return the normal equations less what is pretended, along what is held, with the prior."""
+    R, t = T[:3, :3].copy(), T[:3, 3].copy()
+    H, g, cost = normal_equations(R, t, p, c, u, w)
+    N, h, less = pretended(R, t, p, c, u, w, tilt)
+    H = P.T.copy() @ (H - N) @ P
+    g = P.T.copy() @ (g - h)
+    cost -= less
+    off = motion_between(T_prior, T)
+    for k in range(6):
+        H[k, k] += information[k]
+        g[k] += information[k] * off[k]
+        cost += information[k] * off[k] ** 2
+    return H, g, cost
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _minimise(
-    T: Float64s, p: Float64s, c: Float64s, u: Float64s, w: Float64s, P: Float64s, H: Float64s,
-    g: Float64s, cost: float, iterations: int,
+    T: Float64s, p: Float64s, c: Float64s, u: Float64s, w: Float64s, tilt: Float64s, P: Float64s,
+    T_prior: Float64s, information: Float64s, iterations: int,
 ) -> Float64s:  # fmt: skip
-    """Return the pose after some steps; H, g, cost: the normal equations at T."""
+    """Return the pose after some steps of Levenberg-Marquardt; along what is open it is the prior's
+    where there is one, else that of T."""
+    if information.max() > 0.0:
+        off = motion_between(T_prior, T)
+        T = _stepped(T, P @ off - off)
     damping = 1e-4
-    best = T.copy()
-    R, t, turn = T[:3, :3].copy(), T[:3, 3].copy(), np.empty((3, 3))
+    H, g, cost = _equations(T, p, c, u, w, tilt, P, T_prior, information)
     for _ in range(iterations):
         step = P @ levenberg_marquardt_step(H, g, damping)
-        rotate(step[3:], turn)
-        R_new, t_new = R @ turn, R @ step[:3] + t
-        H_new, g_new, cost_new = normal_equations(R_new, t_new, p, c, u, w)
+        trial = _stepped(T, step)
+        H_new, g_new, cost_new = _equations(trial, p, c, u, w, tilt, P, T_prior, information)
         if cost_new <= cost:
-            R, t, H, g, cost = R_new, t_new, H_new, g_new, cost_new
+            T, H, g, cost = trial, H_new, g_new, cost_new
             damping /= 10.0
             if np.abs(step[:3]).max() < 1e-4 and np.abs(step[3:]).max() < 1e-5:
                 break
         else:
             damping = max(damping, 1e-6) * 100.0
-    best[:3, :3], best[:3, 3] = R, t
-    return best
+    return T
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _stepped(T: Float64s, step: Float64s) -> Float64s:
+    """Return T (4, 4) moved by a step `[t, theta]` of its own frame."""
+    turn, moved = np.empty((3, 3)), np.eye(4)
+    R = T[:3, :3].copy()
+    rotate(step[3:], turn)
+    moved[:3, :3] = R @ turn
+    moved[:3, 3] = R @ step[:3] + T[:3, 3]
+    return moved
 
 
 def settle(
-    T: Float64s, rows: Rows, open_: Openness | None, *, lever: float, tolerance: float
-) -> tuple[Float64s, Openness, Float64s]:
+    T: Float64s, rows: Rows, open_: Openness | None, prior: Prior, *, lever: float,
+    tolerance: float, correct: bool = True,
+) -> tuple[Float64s, Openness, Float64s]:  # fmt: skip
     """Return the pose after a few steps with robust weights, what is open, and the weights (N,).
 
-    open_: what the same rows leave open, where it was found before.
+    open_: what the same rows leave open, where it was found before. What the rows say is taken
+    along directions that they hold and, where `correct`, less what the noise of their normals
+    pretends.
     """
     P, directions = (np.zeros((0, 6)),) * 2 if open_ is None else (open_.P, open_.directions)
     T_new, P, directions, w = _settle(
-        T, rows.p, rows.c, rows.u, rows.sigma, rows.tilt, P, directions, lever, tolerance
-    )
+        T, rows.p, rows.c, rows.u, rows.sigma, rows.tilt, P, directions, prior.T,
+        prior.information, lever, tolerance, correct,
+    )  # fmt: skip
     return T_new, Openness(P, directions, lever), w
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _settle(
     T: Float64s, p: Float64s, c: Float64s, u: Float64s, sigma: Float64s, tilt: Float64s,
-    P: Float64s, directions: Float64s, lever: float, tolerance: float,
+    P: Float64s, directions: Float64s, T_prior: Float64s, information: Float64s, lever: float,
+    tolerance: float, correct: bool,
 ) -> tuple[Float64s, Float64s, Float64s, Float64s]:  # fmt: skip
     """Return T, P, directions and w of `settle`; an empty P is found anew."""
     R, t = T[:3, :3].copy(), T[:3, 3].copy()
     w, spread = bisquare(residuals(R, t, p, c, u) / sigma)
     w /= (spread * sigma) ** 2
-    H, g, cost = normal_equations(R, t, p, c, u, w)
     if len(P) == 0:
-        P, directions = _openness(H, pretended(R, p, u, w, tilt), lever, tolerance)
-    return _minimise(T, p, c, u, w, P, H, g, cost, 2), P, directions, w
-
-
-def _R(T: Float64s) -> Float64s:
-    return np.ascontiguousarray(T[:3, :3])
+        H, _, _ = normal_equations(R, t, p, c, u, w)
+        noise, _, _ = pretended(R, t, p, c, u, w, tilt)
+        P, directions = _openness(H, noise, lever, tolerance)
+    taken_off = tilt if correct else np.zeros(len(tilt))
+    return _minimise(T, p, c, u, w, taken_off, P, T_prior, information, 2), P, directions, w

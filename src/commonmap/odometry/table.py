@@ -172,6 +172,27 @@ def find_troubles(health: Sequence[ScanHealth]) -> tuple[Trouble, ...]:
     return tuple(troubles)
 
 
+BREAK = 5
+"""So many guessed poses in a row (half a second) part a log: where the motion changes by a few
+centimetres a turn, the last of them is off by more than a voxel, and what comes behind with it."""
+
+
+def find_sound_part(health: Sequence[ScanHealth]) -> range:
+    """Return the most turns in a row that no stretch of `BREAK` lost turns or more parts."""
+    start = -1
+    longest = range(0)
+    lost = 0
+    for k, h in enumerate(health):
+        lost = lost + 1 if h.lost else 0
+        if lost == BREAK:
+            start = -1  # the part ended before this stretch
+        if not h.lost:
+            start = k if start < 0 else start
+            if k + 1 - start > len(longest):
+                longest = range(start, k + 1)
+    return longest
+
+
 def take_poses(scans: Iterable[Scan], poses: Trajectory, progress: Progress) -> Odometry:
     """Return the known poses as an answer; the scans must lie within their time."""
     T = np.array([check_T(T, "a pose") for T in poses.T_map_sensor])
