@@ -495,8 +495,8 @@ def draw_claim(rows: Sequence[ReadingRow]) -> Figure:
     axis.set(xlabel="median ratio at the true pose", ylim=(-0.8, len(rows) + 0.6))
     axis.grid(axis="x", color=LINE, lw=0.6)
     axis.set_title(
-        f"Every reading, medians over {rows[0].n} area(s). Shaded: what the paper says; dashed: "
-        "where small differences lead", loc="left", fontsize=9,
+        f"Medians over {rows[0].n} areas. Shaded: what the paper says; dashed: small "
+        "differences", loc="left", fontsize=9,
     )  # fmt: skip
     axis.legend(loc="lower right", frameon=False)
     for side in ("top", "right"):
