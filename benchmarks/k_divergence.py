@@ -27,10 +27,10 @@ import scipy
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from commonmap.matching.arrays import find_rim
 from commonmap.matching.correlate import (
     PreparedTarget,
     Surface,
-    find_rim,
     prepare_target,
     score_half_turns,
 )

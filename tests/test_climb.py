@@ -206,3 +206,16 @@ def test_a_climb_ends_on_what_the_slow_twin_counts(
         )
         for a, b in zip((pose, score, pairs_found), again, strict=True):
             assert a.tobytes() == b.tobytes()
+
+
+def test_a_turned_source_is_kept_for_its_own_place_in_a_cell() -> None:
+    target, columns = scene(9)
+    level = find_level(target, 1, ComputeConfig())
+    yaw = 3 * 0.05
+    poses = np.array([[7.0, 11.0, yaw], [7.0, 11.13, yaw], [7.09, 11.0, yaw], [7.0, 11.0, yaw]])
+    together = climb_all(level, columns, poses, yaw_step=0.05, least_pairs=1.0, starts=HERE)
+    for n, pose in enumerate(poses):
+        alone = climb_all(level, columns, pose[None], yaw_step=0.05, least_pairs=1.0, starts=HERE)
+        for a, b in zip(together, alone, strict=True):
+            assert np.array_equal(a[n], b[0])
+    assert len(set(together[1].tolist())) == 3

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 import device_arrays
 from commonmap.errors import EmptyMapError, InputError, MissingExtraError
 from commonmap.matching import arrays
+from commonmap.matching.arrays import find_rim
 from commonmap.matching.correlate import (
-    find_rim,
     prepare_target,
     score_half_turns,
     score_surface,

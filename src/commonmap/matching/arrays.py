@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import importlib
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numba
 import numpy as np
 import scipy.fft
+from numpy.typing import NDArray
 
 from commonmap.errors import InputError, MissingExtraError
 
@@ -74,6 +75,28 @@ def choose_shape(
         need = max(full - spare, target_shape[axis], source_shape[axis])
         lengths.append(int(scipy.fft.next_fast_len(need, real=axis == 1)))
     return lengths[0], lengths[1]
+
+
+def find_rim(
+    sources: Iterable[NDArray[np.bool_]], source_shape: tuple[int, int], min_cells: int
+) -> tuple[int, int]:
+    """Return how many rows and columns at each end of all sources hold too few cells for a pose.
+
+    sources: known masks (sx, sy) or smaller, as they will be scored, of `source_shape` padded.
+    """
+    rims = list(source_shape)
+    for known in sources:
+        pad = [(0, n - m) for n, m in zip(source_shape, known.shape, strict=True)]
+        padded = np.pad(known, pad)
+        rims = [min(rims[axis], count_rim(padded, axis, min_cells)) for axis in (0, 1)]
+    return rims[0], rims[1]
+
+
+def count_rim(known: NDArray[np.bool_], axis: int, min_cells: int) -> int:
+    """Return how many rows (axis 0) or columns at either end hold fewer than `min_cells` cells."""
+    cells = np.count_nonzero(known, axis=1 - axis)
+    ends = (np.searchsorted(np.cumsum(some), min_cells) for some in (cells, cells[::-1]))
+    return int(min(ends))
 
 
 _own = threading.local()

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from commonmap.errors import EmptyMapError, InputError
-from commonmap.matching.arrays import Array, choose_shape, find_arrays
+from commonmap.matching.arrays import Array, choose_shape, count_rim, find_arrays
 from commonmap.matching.classes import Classes, Steps, class_products
 from commonmap.matching.kernels import Kernel
 from commonmap.matching.roads import Frame, Products, moment_products
@@ -237,34 +237,12 @@ def _source_heights(
     frame = prepared.frame
     for axis in (0, 1):
         told_apart = frame.out_shape[axis] - frame.shape[axis]
-        if _rim_of(known, axis, prepared.min_cells) < told_apart:
+        if count_rim(known, axis, prepared.min_cells) < told_apart:
             raise InputError(
                 f"the target was prepared for sources with fewer than {prepared.min_cells} known "
                 f"cells in the {told_apart} outermost rows; this one has more"
             )
     return np.pad(height, pad), known
-
-
-def find_rim(
-    sources: Iterable[Bools], source_shape: tuple[int, int], min_cells: int
-) -> tuple[int, int]:
-    """Return how many rows and columns at each end of all sources hold too few cells for a pose.
-
-    sources: known masks (sx, sy) or smaller, as they will be scored, of `source_shape` padded.
-    """
-    rims = list(source_shape)
-    for known in sources:
-        pad = [(0, n - m) for n, m in zip(source_shape, known.shape, strict=True)]
-        padded = np.pad(known, pad)
-        rims = [min(rims[axis], _rim_of(padded, axis, min_cells)) for axis in (0, 1)]
-    return rims[0], rims[1]
-
-
-def _rim_of(known: Bools, axis: int, min_cells: int) -> int:
-    """Return how many rows (axis 0) or columns at either end hold fewer than `min_cells` cells."""
-    cells = np.count_nonzero(known, axis=1 - axis)
-    ends = (np.searchsorted(np.cumsum(some), min_cells) for some in (cells, cells[::-1]))
-    return int(min(ends))
 
 
 def _count(

@@ -9,6 +9,7 @@ reaches (the decoy).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import partial
 
@@ -16,6 +17,7 @@ import numpy as np
 
 from commonmap.config import ComputeConfig
 from commonmap.frames import from_xyz_yaw
+from commonmap.matching.arrays import find_rim
 from commonmap.matching.climb import HERE, climb_all, starts_around
 from commonmap.matching.evidence import (
     Columns,
@@ -27,7 +29,14 @@ from commonmap.matching.evidence import (
     weigh,
     xlogx_table,
 )
-from commonmap.matching.tiles import Level, Sweep, find_level, plan_tiles, search_tiles
+from commonmap.matching.tiles import (
+    Level,
+    Sweep,
+    find_level,
+    plan_tiles,
+    search_tiles,
+    turn_columns,
+)
 from commonmap.types import Float64s, Progress, no_progress
 
 CLOSE = 0.64
@@ -229,7 +238,10 @@ def _search_all(
     min_pairs = min_overlap * _known_cells(columns, cell)
     sweep = Sweep(columns, cell, low, side, yaws, min_pairs, compute.arrays)
     at_once = workers if compute.scheduler is None else 1
-    plan = plan_tiles(level.shape, side, columns.n_slabs, compute=compute, workers=at_once)
+    # where the maps touch in so few rows that no pose there has pairs enough, nothing is scored
+    turned = (turn_columns(sweep, float(yaw))[1] > 0 for yaw in yaws)
+    rim = find_rim(turned, (side, side), max(1, math.ceil(min_pairs)))
+    plan = plan_tiles(level.shape, side, columns.n_slabs, compute=compute, workers=at_once, rim=rim)
     found = search_tiles(
         level, sweep, plan.tiles, compute=compute, workers=workers, progress=progress
     )

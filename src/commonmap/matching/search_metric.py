@@ -13,6 +13,7 @@ import numba
 import numpy as np
 
 from commonmap.matching import correlate
+from commonmap.matching.arrays import find_rim
 from commonmap.matching.search import Peaks, count_yaws, separate
 from commonmap.matching.tiles import N_PEAKS, local_maxima
 from commonmap.metrics.plans import DifferenceSum, JointHistogram, MinSum, Smooth
@@ -84,7 +85,7 @@ def search_metric(
         floor=floor,
         height_range=(0.0, float(max(height.max(), t_height.max(), floor))),
         min_cells=min_cells,
-        rim=correlate.find_rim(turned, (side, side), min_cells),
+        rim=find_rim(turned, (side, side), min_cells),
         xp=arrays,
         workers=1,
     )

@@ -9,6 +9,7 @@ of the tiles together are to the bit those of the whole in one piece.
 from __future__ import annotations
 
 import importlib
+import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -24,6 +25,7 @@ from commonmap.config import ComputeConfig
 from commonmap.errors import InputError, MissingExtraError
 from commonmap.matching.arrays import find_arrays
 from commonmap.matching.evidence import (
+    Bits,
     Columns,
     Range,
     SlabGrid,
@@ -132,13 +134,22 @@ class Sweep:
 
 
 def plan_tiles(
-    shape: tuple[int, int], side: int, n_slabs: int, *, compute: ComputeConfig, workers: int
+    shape: tuple[int, int],
+    side: int,
+    n_slabs: int,
+    *,
+    compute: ComputeConfig,
+    workers: int,
+    rim: tuple[int, int] = (0, 0),
 ) -> TilePlan:
     """Return the cheapest tiles that keep the search within `compute.memory_gb`.
 
-    shape: of the target. side: of the source's square. Raises InputError where no tile does.
+    shape: of the target. side: of the source's square. rim: translations at each end along x and
+    y that are left out. Raises InputError where no tile does.
     """
-    whole = (shape[0] + side - 1, shape[1] + side - 1)
+    full = (shape[0] + side - 1, shape[1] + side - 1)
+    rim = (min(rim[0], (full[0] - 1) // 2), min(rim[1], (full[1] - 1) // 2))
+    whole = (full[0] - 2 * rim[0], full[1] - 2 * rim[1])
     best: tuple[float, float, int] | None = None
     least = np.inf
     for n_tiles in range(1, max(whole) // 16 + 2):
@@ -157,9 +168,9 @@ def plan_tiles(
         )
     _, held, extent = best
     tiles = tuple(
-        Tile((u, min(u + extent, whole[0])), (v, min(v + extent, whole[1])))
-        for u in range(0, whole[0], extent)
-        for v in range(0, whole[1], extent)
+        Tile((u, min(u + extent, full[0] - rim[0])), (v, min(v + extent, full[1] - rim[1])))
+        for u in range(rim[0], full[0] - rim[0], extent)
+        for v in range(rim[1], full[1] - rim[1], extent)
     )
     return TilePlan(tiles, held)
 
@@ -270,14 +281,20 @@ def search_tile(
     return np.concatenate(found)
 
 
+def turn_columns(sweep: Sweep, yaw: float) -> tuple[Bits, Bits]:
+    """Return (occupied, known) bits of the source turned by `yaw`, (side, side)."""
+    columns = sweep.columns
+    occupied, known = scatter(
+        columns.xy, columns.occupied, columns.known, math.cos(yaw), math.sin(yaw), sweep.cell,
+        sweep.low, sweep.side, sweep.side,
+    )  # fmt: skip
+    return occupied, known
+
+
 def _search_yaw(yaw: float, *, task: Task, spectra: Spectra) -> Float64s:
     """Return the best separate translations of a tile at one yaw, (n, 3): u, v, score."""
     sweep = task.sweep
-    columns = sweep.columns
-    occupied, known = scatter(
-        columns.xy, columns.occupied, columns.known, float(np.cos(yaw)), float(np.sin(yaw)),
-        sweep.cell, sweep.low, sweep.side, sweep.side,
-    )  # fmt: skip
+    occupied, known = turn_columns(sweep, float(yaw))
     score, _ = evidence_surface(spectra, occupied, known, min_overlap=sweep.min_pairs, workers=1)
     own, seen = task.tile, task.seen
     rim = (
