@@ -221,7 +221,13 @@ class Loam:
             if len(rows) < 20:
                 break
             T_new, _, _ = settle(
-                T, rows, None, prior, lever=self.lever, tolerance=o.tolerance, correct=not first
+                T,
+                rows,
+                None,
+                prior,
+                lever=self.lever,
+                tolerance=o.tolerance,
+                correct=bool(prior.information.any()),
             )
             step = self._moved(T, T_new)
             T = T_new
@@ -296,7 +302,10 @@ class Loam:
                 rows = rows.refresh(here)
             if len(rows) < LEAST_MATCHED:
                 break
-            T_new, open_, w = settle(T, rows, open_, prior, lever=self.lever, tolerance=o.tolerance)
+            T_new, open_, w = settle(
+                T, rows, open_, prior, lever=self.lever, tolerance=o.tolerance,
+                correct=bool(prior.information.any()),
+            )  # fmt: skip
             step = self._moved(T, T_new)
             T = T_new
             if step < 0.01 * self.voxel:
