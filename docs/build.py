@@ -1,7 +1,9 @@
-"""Write the pages that are made from tables; check that links between pages lead somewhere.
+"""Write what pages take from tables and records; check that links between pages lead somewhere.
 
-python docs/build.py            writes docs/metrics.md
+python docs/build.py            fills the marked blocks of docs/metrics.md
 python docs/build.py --check    changes nothing; ends with 1 where a page is not up to date
+
+A block stands between `<!-- NAME -->` and `<!-- end of NAME -->`; the rest is written by hand.
 """
 
 from __future__ import annotations
@@ -11,17 +13,21 @@ import sys
 from pathlib import Path
 
 from commonmap.metrics.table import METRICS
+from commonmap.study.metrics_report import markdown_tables
 
 ROOT = Path(__file__).resolve().parent.parent
+STUDY = ROOT / "benchmarks" / "records" / "study-metrics"
 LINK = re.compile(r"\[[^\]]*\]\(([^)#\s]+)[^)]*\)")
 
 
 def main() -> int:
     """Build or check the pages; return the exit code."""
     path = ROOT / "docs" / "metrics.md"
-    text = metrics_page()
+    there = path.read_text(encoding="utf-8")
+    text = fill(there, "table of metrics", metrics_table())
+    text = fill(text, "results", markdown_tables(STUDY))
     if "--check" in sys.argv:
-        if not path.exists() or path.read_text(encoding="utf-8") != text:
+        if there != text:
             print("docs/metrics.md is not up to date: run `make docs`")
             return 1
     else:
@@ -33,15 +39,18 @@ def main() -> int:
     return 1 if broken else 0
 
 
-def metrics_page() -> str:
-    """Return docs/metrics.md, a row for each row of the table."""
+def fill(page: str, name: str, block: str) -> str:
+    """Return the page with the block of that name replaced; it must be there once."""
+    start, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
+    if page.count(start) != 1 or page.count(end) != 1:
+        raise SystemExit(f"the page must hold {start} and {end} once each")
+    before, after = page.split(start)[0], page.split(end)[1]
+    return f"{before}{start}\n\n{block}\n\n{end}{after}"
+
+
+def metrics_table() -> str:
+    """Return a table with a row for each row of `METRICS`."""
     lines = [
-        "# Similarity metrics",
-        "",
-        "Made by `make docs` from `commonmap.metrics.table.METRICS`. `P` and `Q` (or `a` and `b`)",
-        "are the heights of source and target on the cells that both know, normalised as",
-        "`search.normalise` says.",
-        "",
         "| name | metric | family | formula | better | reference |",
         "|---|---|---|---|---|---|",
     ]
@@ -51,7 +60,7 @@ def metrics_page() -> str:
         lines.append(
             f"| `{name}` | {row.title} | {row.family} | {formula} | {better} | {row.reference} |"
         )
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines)
 
 
 def broken_links() -> list[str]:

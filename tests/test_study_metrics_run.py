@@ -14,7 +14,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from distributed import LocalCluster
 
+from commonmap.cli import main
 from commonmap.errors import InputError
 from commonmap.study import metrics_run
 from commonmap.study.metrics_design import KINDS, plan_study
@@ -150,6 +152,37 @@ def test_a_scheduler_that_does_not_answer_is_said(
     monkeypatch.setattr(metrics_run, "CONNECT_SECONDS", 1)
     with pytest.raises(InputError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"):
         run_study(tmp_path, seed=1, quick=True, scheduler="tcp://127.0.0.1:9", task=make_records)
+
+
+def test_a_scheduler_given_by_its_address_does_the_same(tmp_path: Path, expected: Path) -> None:
+    with LocalCluster(
+        n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None
+    ) as cluster:
+        run_study(
+            tmp_path / "out", seed=SEED, quick=True, scheduler=cluster.scheduler_address,
+            task=make_records,
+        )  # fmt: skip
+    assert _digest(tmp_path / "out/records") == _digest(expected / "records")
+
+
+def test_the_command_reports_what_is_recorded(
+    tmp_path: Path,
+    expected: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def call(out: Path) -> int:
+        monkeypatch.setattr(
+            sys, "argv", ["commonmap", "study", "metrics", "-o", str(out), "--report-only"]
+        )
+        with pytest.raises(SystemExit) as ended:
+            main()
+        return int(ended.value.code or 0)
+
+    assert call(expected) == 0
+    assert "48 pairs of 12 places" in capsys.readouterr().out
+    assert call(tmp_path / "none") == 2
+    assert "holds no records" in capsys.readouterr().err
 
 
 def test_right_is_within_two_cells_and_one_and_a_half_yaw_steps() -> None:

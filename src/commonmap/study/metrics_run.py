@@ -103,7 +103,8 @@ def _run_missing(
         stack.enter_context(dask.config.set({"distributed.scheduler.allowed-failures": DEATHS}))
         client = stack.enter_context(_connect(distributed, scheduler, workers, stack))
         n_threads = max(1, sum(client.nthreads().values()))
-        todo = iter(missing)
+        # another client may be at work on the same folder: look again before each task
+        todo = (item for item in missing if not item[1].exists())
         places: dict[str, Path] = {}
 
         def submit(item: tuple[PlacePlan, Path]) -> Any:
