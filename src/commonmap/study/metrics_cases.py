@@ -21,7 +21,7 @@ from commonmap.sim.pairs import Pair, simulate_pair
 from commonmap.sim.scanning import place_points
 from commonmap.types import Bools, Float64s, GridMap
 
-PLACE, DRIVEN, WIDER = 60.0, 32.0, 20.0
+PLACE, DRIVEN, WIDER = 60.0, 32.0, 14.0
 """Metres: edges of the place and of what the ground robot drives in; by how much the window in the
 drone's map is wider than the area."""
 
