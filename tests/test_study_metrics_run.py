@@ -42,7 +42,7 @@ def make_records(seed: int, index: int) -> list[dict[str, Any]]:
             "xy": rng.uniform(0.0, 4.0, M).round(2).tolist(),
             "yaw_deg": rng.uniform(0.0, 9.0, M).round(1).tolist(),
             "sharpness": rng.uniform(0.0, 9.0, M).round(1).tolist(),
-            "margin": [None] * M,
+            "margin": [None] * M, "strict_xy": [0.5] * M, "strict_yaw_deg": [1.0] * M,
         }
         for k, area in enumerate(plan.areas)
     ]  # fmt: skip

@@ -110,7 +110,8 @@ def run_place(seed: int, index: int) -> list[dict[str, Any]]:
             records.append({**record, "failed": str(problem), **_nothing()})
             continue
         found = search_all(target, source, T_target_source=area.T_target_source)
-        xy, yaw = errors(found, area.T_target_source)
+        xy, yaw = errors(found.pose, found.centre, area.T_target_source)
+        strict_xy, strict_yaw = errors(found.strict, found.centre, area.T_target_source)
         records.append(
             {
                 **record,
@@ -121,6 +122,8 @@ def run_place(seed: int, index: int) -> list[dict[str, Any]]:
                 "yaw_deg": _rounded(np.degrees(yaw), 1),
                 "sharpness": _rounded(found.sharpness, 1),
                 "margin": _rounded(found.margin, 1),
+                "strict_xy": _rounded(strict_xy, 1),
+                "strict_yaw_deg": _rounded(np.degrees(strict_yaw), 1),
             }
         )
     return records
@@ -135,5 +138,5 @@ def _nothing() -> dict[str, Any]:
     none = [None] * len(COLUMNS)
     return {
         "true_overlap": None, "n_poses": 0, "yaw_step_deg": None, "xy": none, "yaw_deg": none,
-        "sharpness": none, "margin": none,
+        "sharpness": none, "margin": none, "strict_xy": none, "strict_yaw_deg": none,
     }  # fmt: skip

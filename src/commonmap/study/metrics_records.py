@@ -31,13 +31,15 @@ CONDITIONS = ("kind", "heights", "grid", "overlap", "noise", "drift", "tilt_deg"
 class Results:
     """Records as arrays: N pairs, M metrics of `LABELS`.
 
-    conditions: one dict a pair. place: (N,) the task, within which pairs are alike. right: (N, M).
+    conditions: one dict a pair. place: (N,) the task, within which pairs are alike. right: (N, M);
+    right_strict: the same where only poses with half of the source's known cells may win.
     xy, yaw_deg, sharpness, margin: (N, M), NaN where there was none.
     """
 
     conditions: list[dict[str, Any]]
     place: np.ndarray[tuple[int], np.dtype[np.int64]]
     right: Bools
+    right_strict: Bools
     xy: Float64s
     yaw_deg: Float64s
     sharpness: Float64s
@@ -88,10 +90,12 @@ def gather(records: list[dict[str, Any]]) -> Results:
         ]
 
     xy, yaw = table("xy"), table("yaw_deg")
-    right = (xy <= NEAR[0] * column("cell")) & (yaw <= NEAR[1] * column("yaw_step_deg"))
+    far, turned = NEAR[0] * column("cell"), NEAR[1] * column("yaw_step_deg")
+    right = (xy <= far) & (yaw <= turned)
+    strict = (table("strict_xy") <= far) & (table("strict_yaw_deg") <= turned)
     conditions = [{**r, "grid": f"{r['size']:g} m, {r['cell']:g} m cells"} for r in records]
     place = np.array([r["index"] for r in records], np.int64)
-    return Results(conditions, place, right, xy, yaw, table("sharpness"), table("margin"))
+    return Results(conditions, place, right, strict, xy, yaw, table("sharpness"), table("margin"))
 
 
 def bootstrap_weights(results: Results) -> Float64s:

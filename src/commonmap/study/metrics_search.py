@@ -30,6 +30,9 @@ N_PEAKS = 6
 APART = (4.0, 3.0)
 """Cells and yaw steps: poses nearer than both are the same optimum."""
 
+STRICT = 0.5
+"""Share of the source's known cells that a pose must lay on known cells by the stricter rule."""
+
 SAMPLE = 23
 """Of the scores of all poses, one in so many tells how they spread."""
 
@@ -43,6 +46,7 @@ class Found:
     sharpness: how far the best pose is above the best one elsewhere, in robust standard deviations
     of all scores (1.4826 times the median deviation from the median). margin: the same for the
     best pose near the truth against the best elsewhere; negative where something else is better.
+    strict: the best pose of those with an overlap of `STRICT` or more, on a step of yaw.
     centre: (2,) the point of the source's frame that the poses place. cell, yaw_step: of the
     search, metres and radians. n_poses: how many were scored.
     """
@@ -51,6 +55,7 @@ class Found:
     score: Float64s
     sharpness: Float64s
     margin: Float64s
+    strict: Float64s
     centre: Float64s
     cell: float
     yaw_step: float
@@ -85,6 +90,7 @@ def search_all(
     side = 2 * int(np.ceil(reach / cell)) + 2
     low = np.full(2, -0.5 * side * cell)
     _, unturned = scatter_heights(xy, height, 1.0, 0.0, cell, low, side, side)
+    n_known = int(np.count_nonzero(unturned))
     n_yaw = count_yaws(float(np.quantile(np.hypot(*xy.T), 0.98)), cell)
     yaws = 2.0 * np.pi * np.arange(n_yaw) / n_yaw
 
@@ -94,12 +100,12 @@ def search_all(
     top = float(max(height.max(), height_t.max(), floor))
     prepared = prepare(
         height_t, known_t, slabs_t, (side, side), top=top, floor=floor,
-        min_cells=max(4, int(np.ceil(min_overlap * np.count_nonzero(unturned)))),
+        min_cells=max(4, int(np.ceil(min_overlap * n_known))),
     )  # fmt: skip
 
     # 2. every yaw: the peaks of each metric, a sample of its scores, the best near the truth
     truth = None if T_target_source is None else _planar(T_target_source, centre)
-    peaks, samples, n_poses = [], [], 0
+    peaks, strict, samples, n_poses = [], [], [], 0
     at_truth = np.full(len(COLUMNS), -np.inf)
     for yaw in yaws:
         cosine, sine = float(np.cos(yaw)), float(np.sin(yaw))
@@ -112,6 +118,13 @@ def search_all(
         rows = best_peaks(gain, scores.u, scores.v, prepared.surface_shape, N_PEAKS)
         at = origin + (rows[..., :2] - (side - 1)) * cell - low
         peaks.append(np.dstack([at, np.full(rows.shape[:2], yaw), rows[..., 2]]))
+        enough = scores.n >= STRICT * n_known
+        rows = best_peaks(
+            np.ascontiguousarray(gain[:, enough]), scores.u[enough], scores.v[enough],
+            prepared.surface_shape, 1,
+        )  # fmt: skip
+        at = origin + (rows[..., :2] - (side - 1)) * cell - low
+        strict.append(np.dstack([at, np.full(rows.shape[:2], yaw), rows[..., 2]]))
         samples.append(gain[:, n_poses % SAMPLE :: SAMPLE])
         n_poses += len(scores.u)
         if truth is not None and _turn(yaw - truth[2]) <= near[1] * 2.0 * np.pi / n_yaw:
@@ -123,14 +136,17 @@ def search_all(
 
     # 3. the best of all yaws, and how far it stands out
     M = len(COLUMNS)
-    pose, best = np.full((M, 3), np.nan), np.full(M, np.nan)
+    pose, best, second = np.full((M, 3), np.nan), np.full(M, np.nan), np.full((M, 3), np.nan)
     sharpness, margin = np.full(M, np.nan), np.full(M, np.nan)
     if not peaks:
-        return Found(pose, best, sharpness, margin, centre, cell, 2.0 * np.pi / n_yaw, 0)
-    every = np.concatenate(peaks, axis=1)
+        return Found(pose, best, sharpness, margin, second, centre, cell, 2.0 * np.pi / n_yaw, 0)
+    every, firm = np.concatenate(peaks, axis=1), np.concatenate(strict, axis=1)
     spread = _robust_spread(np.concatenate(samples, axis=1))
     apart = APART[0] * cell, APART[1] * 2.0 * np.pi / n_yaw
     for m in range(M):
+        rows = firm[m][np.isfinite(firm[m][:, 3])]
+        if len(rows):
+            second[m] = rows[np.argmax(rows[:, 3]), :3]
         rows = every[m][np.isfinite(every[m][:, 3])]
         if not len(rows):
             continue
@@ -144,7 +160,7 @@ def search_all(
             elsewhere = rows[off | (_turn(rows[:, 2] - truth[2]) >= apart[1]), 3]
             if len(elsewhere):
                 margin[m] = (at_truth[m] - elsewhere.max()) / spread[m]
-    return Found(pose, best, sharpness, margin, centre, cell, 2.0 * np.pi / n_yaw, n_poses)
+    return Found(pose, best, sharpness, margin, second, centre, cell, 2.0 * np.pi / n_yaw, n_poses)
 
 
 def _coarse(
@@ -166,10 +182,12 @@ def _planar(T: Float64s, centre: Float64s) -> Float64s:
     return np.array([*(T[:2, :2] @ centre + T[:2, 3]), yaw])
 
 
-def errors(found: Found, T_target_source: Float64s) -> tuple[Float64s, Float64s]:
-    """Return how far each metric's pose is off, metres at the source's centre and radians."""
-    truth = _planar(T_target_source, found.centre)
-    return np.hypot(*(found.pose[:, :2] - truth[:2]).T), _turn(found.pose[:, 2] - truth[2])
+def errors(
+    pose: Float64s, centre: Float64s, T_target_source: Float64s
+) -> tuple[Float64s, Float64s]:
+    """Return how far poses (M, 3) are off, metres at the source's centre and radians, (M,) each."""
+    truth = _planar(T_target_source, centre)
+    return np.hypot(*(pose[:, :2] - truth[:2]).T), _turn(pose[:, 2] - truth[2])
 
 
 def _turn(angle: Float64s | float) -> Float64s:
