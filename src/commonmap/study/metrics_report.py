@@ -155,11 +155,11 @@ def markdown_tables(out: Path) -> str:
     times = json.loads((out / "times.json").read_text(encoding="utf-8"))
     lines = [
         f"{len(results.place)} pairs of {len(np.unique(results.place))} places. Success: share of "
-        "the pairs, and its 95 % interval. Error: median of the right poses. Sharpness:",
-        "medians where the best pose is right / wrong. 30 % / 50 %: success on the pairs that "
-        f"share {100 * STRICT_OVERLAP:.0f} % or more, by the smallest overlap that a pose may have. "
-        "Time: of one yaw in the search (128 x 128 "
-        "target, 64 x 64 source cells, one thread), as a multiple of `evidence`.",
+        "the pairs, and its 95 % interval. 30 % / 50 %: success on the pairs that share "
+        f"{100 * STRICT_OVERLAP:.0f} % or more,",
+        "by the smallest overlap that a pose may have. Error: median of the right poses. "
+        "Sharpness: medians where the best pose is right / wrong. Time: of one yaw in the",
+        "search (128 x 128 target, 64 x 64 source cells, one thread), as a multiple of `evidence`.",
         "",
         "| metric | success | 30 % / 50 % | error | sharpness | time |",
         "|---|---|---|---|---|---|",
@@ -170,10 +170,9 @@ def markdown_tables(out: Path) -> str:
         cost = f"{times[name] / unit:.1f}" if name in times else "no fast form"
         error = f"{row['error_m']} m, {row['error_deg']} deg" if row["error_m"] else "–"
         sharp = f"{row['sharpness_right'] or '–'} / {row['sharpness_wrong'] or '–'}"
-        lines.append(
-            f"| `{row['metric']}` | {row['success']} % ({row['success_low']} to "
-            f"{row['success_high']}) | {row['success_06']} / {row['success_06_strict']} | {error} | {sharp} | {cost} |"
-        )
+        rate = f"{row['success']} % ({row['success_low']} to {row['success_high']})"
+        both = f"{row['success_06']} / {row['success_06_strict']}"
+        lines.append(f"| `{row['metric']}` | {rate} | {both} | {error} | {sharp} | {cost} |")
     lines += ["", "Success in per cent by condition:", ""]
     lines += ["| condition | pairs | " + " | ".join(f"`{m}`" for m in MAIN) + " |"]
     lines += ["|---|---|" + "---|" * len(MAIN)]
