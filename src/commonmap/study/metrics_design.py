@@ -110,8 +110,8 @@ def run_place(seed: int, index: int) -> list[dict[str, Any]]:
             records.append({**record, "failed": str(problem), **_nothing()})
             continue
         found = search_all(target, source, T_target_source=area.T_target_source)
-        xy, yaw = errors(found.pose, found.centre, area.T_target_source)
-        strict_xy, strict_yaw = errors(found.strict, found.centre, area.T_target_source)
+        xy, yaw = errors(found, area.T_target_source)
+        strict_xy, strict_yaw = errors(found, area.T_target_source, strict=True)
         records.append(
             {
                 **record,

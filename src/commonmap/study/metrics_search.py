@@ -183,10 +183,13 @@ def _planar(T: Float64s, centre: Float64s) -> Float64s:
 
 
 def errors(
-    pose: Float64s, centre: Float64s, T_target_source: Float64s
+    found: Found, T_target_source: Float64s, *, strict: bool = False
 ) -> tuple[Float64s, Float64s]:
-    """Return how far poses (M, 3) are off, metres at the source's centre and radians, (M,) each."""
-    truth = _planar(T_target_source, centre)
+    """Return how far each metric's pose is off, metres at the source's centre and radians.
+
+    strict: of the best poses by the stricter rule of the smallest overlap.
+    """
+    pose, truth = found.strict if strict else found.pose, _planar(T_target_source, found.centre)
     return np.hypot(*(pose[:, :2] - truth[:2]).T), _turn(pose[:, 2] - truth[2])
 
 
