@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from commonmap.metrics.table import METRICS
-from commonmap.study.metrics_records import Results, success
+from commonmap.study.metrics_records import Results, strict_rates, success
 from commonmap.study.metrics_scores import COLUMNS, LABELS
 from commonmap.types import Float64s
 
@@ -45,6 +45,9 @@ def _success(plt: Any, results: Results, weights: Float64s) -> Any:
     colours = dict(zip(families, plt.get_cmap("tab20").colors, strict=False))
     figure, axes = plt.subplots(figsize=(7.5, 11.0))
     told = set()
+    strict = 100.0 * strict_rates(results)[1]
+    axes.plot(strict[order], range(len(order)), "x", color="0.6", ms=4,
+              label="overlap of 60 % or more, and poses of 50 % or more")  # fmt: skip
     for row, m in enumerate(order):
         family = METRICS[COLUMNS[m][0]].family
         label = None if family in told else family
@@ -129,6 +132,7 @@ def _sharpness(plt: Any, results: Results, weights: Float64s) -> Any:
                 axes.plot(k + side, q2, "o", color="black", ms=3)
     axes.set_xticks(range(len(SHOWN)), SHOWN)
     axes.set_yscale("symlog", linthresh=0.1)
+    axes.set_ylim(bottom=0.0)
     axes.set_ylabel("best less best elsewhere, robust sd")
     axes.set_title(
         "green: the best pose is right; red: it is wrong (5, 25, 50, 75, 95 %)", fontsize=9

@@ -27,6 +27,10 @@ CONDITIONS = ("kind", "heights", "grid", "overlap", "noise", "drift", "tilt_deg"
 """What the success rate is told by; "grid" is the edge of the area and of a cell."""
 
 
+STRICT_OVERLAP = 0.6
+"""Asked overlap from which on the stricter rule of the smallest overlap is told."""
+
+
 @dataclass(frozen=True, eq=False)
 class Results:
     """Records as arrays: N pairs, M metrics of `LABELS`.
@@ -137,3 +141,15 @@ def median_where(values: Float64s, where: Bools) -> Float64s:
         if len(some):
             out[m] = np.median(some)
     return out
+
+
+def strict_rates(results: Results) -> tuple[Float64s, Float64s]:
+    """Return the success of each metric where the overlap is `STRICT_OVERLAP` or more.
+
+    First as everywhere; then where a pose must lay half of the source's known cells on known ones.
+    """
+    wide = np.array([c["overlap"] >= STRICT_OVERLAP for c in results.conditions])
+    if not wide.any():
+        none = np.full(len(LABELS), np.nan)
+        return none, none
+    return results.right[wide].mean(axis=0), results.right_strict[wide].mean(axis=0)

@@ -14,6 +14,7 @@ from commonmap.metrics.table import METRICS
 from commonmap.study.metrics_records import (
     CONDITIONS,
     PACKED,
+    STRICT_OVERLAP,
     Results,
     bootstrap_weights,
     gaps,
@@ -21,6 +22,7 @@ from commonmap.study.metrics_records import (
     median_where,
     pack_records,
     read_records,
+    strict_rates,
     success,
 )
 from commonmap.study.metrics_scores import COLUMNS, LABELS
@@ -28,10 +30,6 @@ from commonmap.types import Float64s
 
 MAIN = ("evidence", "mi", "zncc", "ncc", "sad", "ssd", "jensen-shannon", "k", "kl", "jeffreys")
 """Metrics that are told by condition: the best known of each family and the source paper's."""
-
-
-STRICT_OVERLAP = 0.6
-"""Asked overlap from which on the stricter rule of the smallest overlap is told."""
 
 
 def write_report(out: Path) -> str:
@@ -94,18 +92,6 @@ def metric_rows(results: Results, weights: Float64s) -> list[dict[str, Any]]:
         }
         for m in order
     ]
-
-
-def strict_rates(results: Results) -> tuple[Float64s, Float64s]:
-    """Return the success of each metric where the overlap is `STRICT_OVERLAP` or more.
-
-    First as everywhere; then where a pose must lay half of the source's known cells on known ones.
-    """
-    wide = np.array([c["overlap"] >= STRICT_OVERLAP for c in results.conditions])
-    if not wide.any():
-        none = np.full(len(LABELS), np.nan)
-        return none, none
-    return results.right[wide].mean(axis=0), results.right_strict[wide].mean(axis=0)
 
 
 def condition_rows(results: Results, weights: Float64s) -> list[dict[str, Any]]:
