@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import importlib
 import os
 import signal
 import subprocess
@@ -14,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from distributed import LocalCluster
 
 from commonmap.cli import main
 from commonmap.errors import InputError
@@ -155,7 +155,8 @@ def test_a_scheduler_that_does_not_answer_is_said(
 
 
 def test_a_scheduler_given_by_its_address_does_the_same(tmp_path: Path, expected: Path) -> None:
-    with LocalCluster(
+    distributed: Any = importlib.import_module("distributed")
+    with distributed.LocalCluster(
         n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None
     ) as cluster:
         run_study(
