@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 
 from commonmap.metrics.table import METRICS
-from commonmap.study.metrics_report import markdown_tables
+from commonmap.study.metrics_report import markdown_answer, markdown_tables
 
 ROOT = Path(__file__).resolve().parent.parent
 STUDY = ROOT / "benchmarks" / "records" / "study-metrics"
@@ -25,6 +25,7 @@ def main() -> int:
     path = ROOT / "docs" / "metrics.md"
     there = path.read_text(encoding="utf-8")
     text = fill(there, "table of metrics", metrics_table())
+    text = fill(text, "answer", markdown_answer(STUDY))
     text = fill(text, "results", markdown_tables(STUDY))
     if "--check" in sys.argv:
         if there != text:

@@ -134,6 +134,34 @@ def _write(path: Path, rows: list[dict[str, Any]]) -> None:
 # Tables for the page ------------------------------------------------------------------------------
 
 
+SHORT = (
+    "evidence", "zncc", "mi", "squared-euclidean", "cosine", "city-block", "hellinger",
+    "jensen-shannon", "k", "jeffreys", "kl", "k (map)", "k (off)", "jeffreys (off)",
+)  # fmt: skip
+"""Metrics of the short table at the head of the page."""
+
+
+def markdown_answer(out: Path) -> str:
+    """Return the short table of docs/metrics.md from the records in `out`."""
+    results = gather(read_records(out))
+    weights = bootstrap_weights(results)
+    rows = {row["metric"]: row for row in metric_rows(results, weights)}
+    n_wide = sum(c["overlap"] >= STRICT_OVERLAP for c in results.conditions)
+    lines = [
+        f"| metric | right, of {len(results.place)} pairs | less than the best by | "
+        f"right, of the {n_wide} that share 60 % or more | the same, poses of 50 % or more only |",
+        "|---|---|---|---|---|",
+    ]
+    for name in SHORT:
+        row = rows[name]
+        rate = f"{row['success']} % ({row['success_low']} to {row['success_high']})"
+        gap = f"{row['behind_best']} ({row['behind_best_low']} to {row['behind_best_high']})"
+        lines.append(
+            f"| `{name}` | {rate} | {gap} | {row['success_06']} % | {row['success_06_strict']} % |"
+        )
+    return "\n".join(lines)
+
+
 def markdown_tables(out: Path) -> str:
     """Return the tables of docs/metrics.md from the records in `out`."""
     results = gather(read_records(out))
