@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import resource
+import sqlite3
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -75,6 +77,22 @@ def test_damaged_poses_raise_known_errors(kind: str, tmp_path: Path) -> None:
     for i in range(N):
         victim.damage(i, rng)
         run_all(jobs_on_poses(path))
+
+
+@pytest.mark.parametrize("column", ["name", "type"])
+def test_a_database_without_the_text_of_a_topic(column: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.db3"
+    LOGS["db3"][1](path)
+    with contextlib.closing(sqlite3.connect(path)) as database, database:
+        table = "topics"
+        sql = database.execute("SELECT sql FROM sqlite_master WHERE name = ?", [table]).fetchone()
+        database.execute("PRAGMA writable_schema = ON")
+        loose = sql[0].replace(" NOT NULL", "")
+        database.execute("UPDATE sqlite_master SET sql = ? WHERE name = ?", [loose, table])
+    with contextlib.closing(sqlite3.connect(path)) as database, database:
+        database.execute(f"UPDATE {table} SET {column} = NULL")
+    for keep_partial in (False, True):
+        run_all(jobs_on_log(path, keep_partial=keep_partial))
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))

@@ -262,6 +262,8 @@ def _topics(connections: Sequence[Any]) -> tuple[Topic, ...]:
     """Return the topics, each once, by name."""
     found: dict[str, Topic] = {}
     for c in connections:
+        if not isinstance(c.topic, str) or not isinstance(c.msgtype, str):
+            continue  # a damaged database has cells without text
         old = found.get(c.topic)
         if old is None:
             found[c.topic] = Topic(c.topic, c.msgtype, c.msgcount, _holds(c.msgtype))
