@@ -102,6 +102,26 @@ def test_errors_of_many_looks_are_as_large_as_told() -> None:
     assert 2.0 < np.mean(nees) < 12.0
 
 
+def test_loose_surfaces_may_all_be_shifted_alike() -> None:
+    # sheets with a residual scale of 0.1 m: 0.1 * sqrt(0.1^2 - 0.02^2) = 9.8 mm, level only
+    rng = np.random.default_rng(11)
+    points, normals = corner(rng, 0.0, n=20_000)
+    source, _ = corner(rng, 0.1, n=40_000)
+    surface = Surface(points, normals, cKDTree(points))
+    pairs = pair_points(surface, source, np.eye(4), reach=1.0)
+    assert pairs is not None and pairs.scale == pytest.approx(0.1, rel=0.05)
+    told = measure_covariance(surface, source, np.eye(4), pairs, reach=1.0, spacing=0.1)
+    expected = 0.01 * (pairs.scale**2 - 0.02**2)
+    assert told[0, 0] > expected and told[1, 1] > expected
+    assert told[2, 2] < 0.5 * expected
+    # what is as flat as a lidar's noise has no such shift
+    flat, _ = corner(rng, 0.015, n=40_000)
+    pairs = pair_points(surface, flat, np.eye(4), reach=1.0)
+    assert pairs is not None
+    told = measure_covariance(surface, flat, np.eye(4), pairs, reach=1.0, spacing=0.1)
+    assert told[0, 0] < 0.1 * expected
+
+
 def test_a_single_patch_is_told_as_little_known() -> None:
     rng = np.random.default_rng(7)
     J = rng.normal(size=(40, 6))

@@ -35,8 +35,17 @@ LEAST_GRIP = 0.02
 PROBED_POINTS = 10_000
 """Points that K is measured on."""
 
-SMALLEST = np.diag([1e-3**2] * 3 + [1e-5**2] * 3)
-"""Nothing is known better than to a millimetre and a thousandth of a degree, (6, 6)."""
+SMALLEST = np.diag([1e-4**2] * 3 + [1e-6**2] * 3)
+"""Nothing is known better than to a tenth of a millimetre and a microradian, (6, 6)."""
+
+FLAT = 0.02
+"""Metres, the residuals' scale of two lidars on flat surfaces."""
+
+COMMON = 0.1
+"""Share of what the scale exceeds that by, by which all surfaces may be shifted alike.
+
+Crowns and hedges are entered by rays: what one robot sees of them lies on its own side, and the
+other's on the other. Such a shift is common to all patches, so none of them tells of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,8 +115,14 @@ def measure_covariance(
     spreads = [_spread(pairs, n) for n in PATCHES]
     sizes = [float(np.trace(K_inverse @ B)) for B in spreads]
     B = np.mean(spreads, axis=0) * (max(sizes) / max(float(np.mean(sizes)), 1e-300))
-    covariance = K_inverse @ B @ K_inverse + SMALLEST
+    covariance = K_inverse @ B @ K_inverse + SMALLEST + _common(pairs.scale)
     return np.asarray(0.5 * (covariance + covariance.T))
+
+
+def _common(scale: float) -> Float64s:
+    """Return the covariance (6, 6) of a level shift that all loose surfaces have in common."""
+    loose = max(scale**2 - FLAT**2, 0.0)
+    return np.asarray(np.diag([COMMON**2 * loose] * 2 + [0.0] * 4))
 
 
 def _spread(pairs: Pairs, n_side: int) -> Float64s:

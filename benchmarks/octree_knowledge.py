@@ -1,0 +1,170 @@
+"""Does it help the search to know what the octree knows: what was seen free, and what was not seen?
+
+    python benchmarks/octree_knowledge.py [--first 30000] [--pairs 48] [--out benchmarks/records]
+
+Two robots are simulated in one place; the rays of both go into octrees. The occupied slabs of a
+column are the same in all ways of looking at it, what counts as *not occupied* is not:
+
+    points   a column that holds any point is known in all slabs (what `match` does)
+    octree   a slab is known where the octree saw at least half of it free, or it is occupied
+    seen     both: a slab of a column with points counts only where the octree saw it free
+    either   one or the other: free columns without a point are known too
+
+Every way searches the same pair, and the mirrored draft. The record of a pair holds for each way
+whether the best pose is within 1 m and 2 degrees of the truth, and its score over the mirrored
+draft's best and over the best pose elsewhere. Every second pair uses heights under 1 m only.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from commonmap.config import Config
+from commonmap.frames import apply, difference, invert
+from commonmap.mapping.octree import Octree
+from commonmap.mapping.octree_columns import octree_columns
+from commonmap.matching.evidence import SlabGrid, pack_slabs
+from commonmap.matching.figures import other_poses
+from commonmap.matching.maps import Layers, Prepared, build_layers, choose_grid, prepare
+from commonmap.matching.match import least_overlap
+from commonmap.matching.search import search
+from commonmap.sim.pairs import simulate_pair
+from commonmap.types import Bools, Cloud
+
+KINDS = ("forest", "village", "industrial", "city", "field", "paper")
+WAYS = ("points", "octree", "seen", "either")
+
+
+def see_free(item: Prepared, cloud: Cloud, layers: Layers, cell: float) -> Bools:
+    """Return (n_slabs, nx, ny), what an octree of the cloud's rays saw free of the layers' grid."""
+    tree = Octree(0.5 * cell)
+    ends, starts = (apply(item.T_prepared_map, xyz) for xyz in (cloud.xyz, cloud.origin))
+    turn = np.floor((cloud.time - cloud.time.min()) / 0.1).astype(int)
+    order = np.argsort(turn, kind="stable")
+    for part in np.split(order, np.flatnonzero(np.diff(turn[order])) + 1):
+        tree.insert(starts[part], ends[part], discretize=True)
+    grid = layers.grid
+    n_x, n_y = grid["known"].shape
+    i, j = np.indices((n_x, n_y)).reshape(2, -1)
+    middle = grid.origin + (np.column_stack([i, j]) + 0.5) * grid.cell
+    ground = item.ground.height_at(middle).reshape(n_x, n_y)
+    columns = octree_columns(
+        tree.leaves(), grid.origin, grid.cell, (n_x, n_y), ground=ground,
+        slab_edges=grid.slab_edges,
+    )  # fmt: skip
+    return np.asarray(columns["free_share"] >= 0.5)
+
+
+def slabs_of(way: str, layers: Layers, free: Bools) -> SlabGrid:
+    """Return the slabs of a map, known in one of the ways."""
+    grid = layers.grid
+    occupied, column = grid["slab_occupied"], grid["slab_known"]
+    known = {
+        "points": column, "octree": free, "seen": column & free, "either": column | free,
+    }[way]  # fmt: skip
+    return pack_slabs(grid.origin, grid.cell, occupied, known | occupied)
+
+
+def run(seed: int) -> dict[str, Any]:
+    """Return the record of a pair."""
+    rng = np.random.default_rng(seed)
+    kind = KINDS[seed % len(KINDS)]
+    conditions = {
+        "overlap": float(rng.choice([0.45, 0.3, 0.2, 0.15])),
+        "drift": float(rng.choice([0, 0.003])),
+        "change": float(rng.choice([0, 0.3])),
+    }
+    pair = simulate_pair(kind, rng=rng, max_points=250_000, azimuth_decimation=8, **conditions)
+    config = Config().with_values(grid={"max_height": 1.0 if (seed // len(KINDS)) % 2 else None})
+    clouds = (pair.target, pair.source)
+    items = [prepare(c, n, config) for c, n in zip(clouds, ("target", "source"), strict=True)]
+    cell, edges, max_height = choose_grid(*items, config)
+    layers = [build_layers(item, cell, edges, max_height) for item in items]
+    free = [
+        see_free(item, cloud, each, cell)
+        for item, cloud, each in zip(items, clouds, layers, strict=True)
+    ]
+    T_true = items[0].T_prepared_map @ pair.T_target_source @ invert(items[1].T_prepared_map)
+    middle = items[1].xyz.mean(axis=0)
+    record: dict[str, Any] = {
+        "seed": seed, "kind": kind, **conditions, "overlap": pair.overlap, "max_height": max_height,
+        "cell": cell,
+    }  # fmt: skip
+    for way in WAYS:
+        start = time.process_time()
+        target, source = (slabs_of(way, one, f) for one, f in zip(layers, free, strict=True))
+        found, decoy = (
+            search(target, source, min_overlap=least_overlap(config), mirrored=m, workers=1)
+            for m in (False, True)
+        )
+        record[way] = {"right": False, "cpu_seconds": time.process_time() - start}
+        if len(found.score) and len(decoy.score):
+            flat = T_true.copy()
+            T = found.T_target_source()
+            T[2, 3] = flat[2, 3] = 0.0
+            metres, radians = difference(T, flat, middle * (1, 1, 0))
+            away = other_poses(found, found.pose[0], cell)
+            second = float(found.score[away].max(initial=1e-9))
+            record[way] |= {
+                "right": bool(metres < 1.0 and radians < np.radians(2.0)),
+                "score": float(found.score[0]),
+                "decoy_ratio": float(found.score[0] / max(decoy.score[0], 1e-9)),
+                "second_ratio": float(found.score[0] / second),
+            }
+    return record
+
+
+def main() -> None:
+    """Run the pairs, keep their records, and print the success of every way."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--first", type=int, default=30_000)
+    parser.add_argument("--pairs", type=int, default=48)
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "records")
+    options = parser.parse_args()
+    logging.getLogger("commonmap").setLevel(logging.ERROR)
+    path = options.out / "octree_knowledge.jsonl"
+    records = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    done = {r["seed"] for r in records}
+    for seed in range(options.first, options.first + options.pairs):
+        if seed in done:
+            continue
+        records.append(run(seed))
+        with path.open("a") as out:
+            out.write(json.dumps(records[-1]) + "\n")
+        print(
+            seed,
+            records[-1]["kind"],
+            f"{records[-1]['overlap']:.2f}",
+            *(f"{way} {'right' if records[-1][way]['right'] else '-'}" for way in WAYS),
+            flush=True,
+        )
+    show(records)
+
+
+def show(records: list[dict[str, Any]]) -> None:
+    """Print the table: right answers by kind and way, and the median ratios where all are right."""
+    print("| | pairs | " + " | ".join(WAYS) + " |\n|---|---|" + "---|" * len(WAYS))
+    for kind in (*KINDS, "all"):
+        some = [r for r in records if kind in (r["kind"], "all")]
+        print(
+            f"| {kind} | {len(some)} | "
+            + " | ".join(str(sum(r[way]["right"] for r in some)) for way in WAYS)
+            + " |"
+        )
+    both = [r for r in records if all(r[way]["right"] for way in WAYS)]
+    for name in ("decoy_ratio", "second_ratio"):
+        print(
+            f"median {name} where all are right ({len(both)}): "
+            + ", ".join(f"{w} {np.median([r[w][name] for r in both]):.2f}" for w in WAYS if both)
+        )
+
+
+if __name__ == "__main__":
+    main()
