@@ -5,7 +5,7 @@
     python benchmarks/peers.py table                   # writes the tables into README and docs
 
 Every run is a process of its own on one core, with a limit of 120 s of CPU time. Its answer goes,
-with all that is known about it, as one line into `records/peers.jsonl`; lines are added and never
+with all that is known about it, as one line into `records/peers.jsonl.xz`; lines are added and never
 rewritten. `--python` names a second interpreter for the peers whose libraries this one lacks
 (`pip install kiss-matcher open3d map-closures small_gicp` there). Who can run nowhere is skipped,
 and the reason is shown. The pairs (`peers_pairs.py`) are made once and kept in `--folder`.
@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import lzma
 import os
 import platform
 import statistics
@@ -35,7 +36,7 @@ from commonmap.frames import difference
 from commonmap.io.atomic import writing
 
 HERE = Path(__file__).resolve().parent
-RECORDS = HERE / "records" / "peers.jsonl"
+RECORDS = HERE / "records" / "peers.jsonl.xz"
 PAGES = (HERE.parent / "README.md", HERE.parent / "docs" / "peers.md")
 WITHIN = {"1 m, 2°": (1.0, 2.0), "0.5 m, 5°": (0.5, 5.0), "0.3 m, 0.5°": (0.3, 0.5)}
 RIGHT = WITHIN["1 m, 2°"]
@@ -107,7 +108,8 @@ def read_records() -> list[Record]:
     """Return all records, oldest first."""
     if not RECORDS.exists():
         return []
-    return [json.loads(line) for line in RECORDS.read_text(encoding="utf-8").splitlines()]
+    with lzma.open(RECORDS, "rt", encoding="utf-8") as lines:
+        return [json.loads(line) for line in lines]
 
 
 def key_of(case: str, name: str, revision: str) -> tuple[str, str, str]:
@@ -126,7 +128,7 @@ def run_all(folder: Path, peers: list[str], other: str | None) -> None:
             if key_of(case.name, name, commit()) in done:
                 continue
             record = run(case, name, python)
-            with RECORDS.open("a", encoding="utf-8") as out:
+            with lzma.open(RECORDS, "at", encoding="utf-8") as out:
                 out.write(json.dumps(record) + "\n")
             print(
                 f"{case.name:12s} {case.family:10s} {name:14s} "
