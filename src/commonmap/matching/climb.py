@@ -25,8 +25,7 @@ from commonmap.matching.evidence import (
     Columns,
     SlabGrid,
     is_shared,
-    signed_evidence,
-    uncertainty,
+    sum_table,
     weigh,
     xlogx_table,
 )
@@ -360,12 +359,8 @@ def _score(  # type: ignore[no-untyped-def]
         int(place[0]) + (i >> 1) - around - first_i, int(place[1]) + (j >> 1) - around - first_j,
         pad, counts,
     )  # fmt: skip
-    most, evidence, doubt = 0, 0.0, 0.0
-    for k in range(counts.shape[0]):
-        n, r, c = int(counts[k, 0]), int(counts[k, 1]), int(counts[k, 2])
-        most = max(most, n)
-        evidence += signed_evidence(n, r, c, int(counts[k, 3]), xlogx)
-        doubt += uncertainty(n, r, xlogx)
+    most = int(counts[:, 0].max())
+    evidence, doubt = sum_table(counts, xlogx)
     node = at[0], at[1], at[2]
     score[node] = weigh(evidence, doubt) if most >= least_pairs else -np.inf
     pairs[node] = most

@@ -375,7 +375,7 @@ def sum_table(table, xlogx):  # type: ignore[no-untyped-def]
     """Return (evidence, doubt), nats, of a pose's table (n_slabs, 4): n, n_1, n_2, n11."""
     evidence, doubt = 0.0, 0.0
     for k in range(table.shape[0]):
-        n, r, c, n11 = table[k]
+        n, r, c, n11 = int(table[k, 0]), int(table[k, 1]), int(table[k, 2]), int(table[k, 3])
         evidence += signed_evidence(n, r, c, n11, xlogx)
         doubt += uncertainty(n, r, xlogx)
     return evidence, doubt
