@@ -14,8 +14,6 @@ from commonmap.odometry.features import choose, exclude, noise_floor, roughness
 from commonmap.odometry.geometry import (
     complete_scan,
     complete_scans,
-    derive_rings,
-    derive_times,
     find_lack,
 )
 from commonmap.odometry.local_map import LocalMap, thin
@@ -472,17 +470,6 @@ def test_a_sparse_turn_does_not_make_a_log_lack_rings() -> None:
     notes: list[str] = []
     assert list(complete_scans([sparse, full, sparse], notes)) == [sparse, full, sparse]
     assert notes == []
-
-
-def test_rings_are_derived_from_points_in_the_order_of_rings() -> None:
-    scan, (time, ring) = turn_of_vlp16(np.random.default_rng(6))
-    order = np.lexsort((time, -ring))  # highest ring first, as in KITTI's files
-    found, by_order = derive_rings(scan.xyz[order])
-    assert by_order
-    assert (found != ring[order]).mean() < 1e-3  # where a ring ends and the next begins
-    derived = derive_times(scan.xyz[order], found, 7.0, 0.1)
-    wrong = np.abs(derived - 7.0 - time[order]) > 1e-3
-    assert wrong.mean() < 0.01  # at most where the turn begins and ends
 
 
 def test_inverse_of_a_motion_is_that_of_its_matrix() -> None:

@@ -134,7 +134,7 @@ def take_log(path: Path, options: LogOptions, progress: Progress) -> RobotMap:
 
     robot = map_log(
         lambda: options.scans(path, hear), method=method, poses=known, acceleration=acceleration,
-        share=lambda: read, name=path.name, progress=progress,
+        deskewed=options.deskewed, share=lambda: read, name=path.name, progress=progress,
     )  # fmt: skip
     for note in robot.notes:
         log.warning("%s: %s", path.name, note)

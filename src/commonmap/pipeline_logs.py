@@ -18,6 +18,7 @@ from commonmap.mapping.level import Levelling, no_levelling
 from commonmap.mapping.level_log import level_log
 from commonmap.odometry import (
     Accumulator,
+    LoamOptions,
     Odometry,
     TrajectoryErrors,
     Trouble,
@@ -28,7 +29,6 @@ from commonmap.odometry import (
     find_troubles,
     georeference,
 )
-from commonmap.odometry.geometry import complete_scans
 from commonmap.types import Cloud, Float64s, Progress, Scan, Trajectory, no_progress
 
 MAX_POINTS = 1_500_000
@@ -80,6 +80,7 @@ def map_log(
     method: str = "loam",
     poses: Trajectory | None = None,
     acceleration: Acceleration | None = None,
+    deskewed: bool | None = None,
     max_points: int = MAX_POINTS,
     share: Callable[[], float] | None = None,
     name: str = "the log",
@@ -91,18 +92,21 @@ def map_log(
         memory at a time.
     method: a row of `ODOMETRY`. poses: known poses of the sensor, for method "poses"; the map is
         then in their frame, as it is. acceleration: of an IMU, where the log has one.
+    deskewed: whether the maker of the log moved the points of a turn to one moment; None tries.
     share: tells what share of the log has been read, for the progress. name: of the log there.
     """
     # 1. where the sensor was at each turn; the frame is that of the sensor at the start
     turns = _telling(read(), f"odometry of {name}", share, progress)
-    answer = estimate(turns, method=method, poses=poses)
+    options = LoamOptions(deskew=None if deskewed is None else not deskewed)
+    answer = estimate(turns, method=method, poses=poses, options=options)
     _require_some(answer, name)
 
     # 2. every point at its place, deskewed; what lies in one voxel is kept once: (N, 3)
     gathered = Accumulator(max_points=max_points)
     turns = _telling(read(), f"map of {name}", share, progress)
     counted = _Counter(answer)
-    for cloud in georeference(counted.placeable(complete_scans(turns, [])), answer.trajectory):
+    placeable = counted.placeable(answer.as_taken(turns))
+    for cloud in georeference(placeable, answer.trajectory):
         gathered.add(cloud)
     cloud = gathered.cloud()
 
@@ -236,7 +240,8 @@ def _turned(answer: Odometry, T: Float64s) -> Odometry:
     told = set(describe_health(answer.health))
     health = tuple(h.turned(T[:3, :3]) for h in answer.health)
     notes = (*(n for n in answer.notes if n not in told), *describe_health(health))
-    return Odometry(answer.method, move_trajectory(T, answer.trajectory), health, notes)
+    trajectory = move_trajectory(T, answer.trajectory)
+    return replace(answer, trajectory=trajectory, health=health, notes=notes)
 
 
 def _notes(answer: Odometry, levelling: Levelling, counted: _Counter) -> tuple[str, ...]:

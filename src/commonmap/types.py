@@ -100,6 +100,8 @@ class Scan:
     ring: (N,) uint16, the channel, lowest first.
     intensity: (N,) float32.
     stamp: seconds, the time of the first firing of the turn.
+    timed: whether the log told the times; else they were derived from the azimuth, and the points
+        may have been moved to one moment by whoever made the log.
     """
 
     xyz: Float32s
@@ -107,6 +109,7 @@ class Scan:
     ring: NDArray[np.uint16]
     intensity: Float32s
     stamp: float
+    timed: bool = True
 
 
 @dataclass(frozen=True, eq=False)

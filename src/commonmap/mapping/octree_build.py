@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 from commonmap.errors import EmptyMapError, InputError
 from commonmap.mapping.octree import Octree
 from commonmap.odometry import Odometry, covers, georeference
-from commonmap.odometry.geometry import complete_scans
 from commonmap.types import Cloud, Float64s, Progress, Scan, Trajectory, no_progress
 
 TURN = 0.1
@@ -109,7 +108,7 @@ class _Placeable:
 
     def __init__(self, scans: Iterable[Scan], odometry: Odometry) -> None:
         self.n = 0
-        self._scans = complete_scans(scans, [])
+        self._scans = odometry.as_taken(scans)
         self._trajectory = odometry.trajectory
         self._lost = {n for n, health in enumerate(odometry.health) if health.lost}
 

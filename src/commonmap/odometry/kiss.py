@@ -21,7 +21,7 @@ def estimate_kiss_icp(
     """Return the trajectory by KISS-ICP with its default settings.
 
     voxel: metres; its own default is `max_range / 100`. Poses are for the end of each turn, to
-    which it deskews, or for its first point where `deskew` is off.
+    which it deskews, or for its stamp where `deskew` is off.
     """
     from kiss_icp.config import KISSConfig
     from kiss_icp.config.config import (
@@ -47,6 +47,7 @@ def estimate_kiss_icp(
         first, last = float(scan.time.min()), float(scan.time.max())
         share = (scan.time - first) / max(last - first, 1e-9)
         icp.register_frame(scan.xyz.astype(np.float64), share if deskew else np.zeros(0))
-        moments.append(last if deskew else first)
+        moments.append(last if deskew else scan.stamp)
         poses.append(np.array(icp.last_pose))
-    return Odometry("kiss-icp", Trajectory(np.array(moments), np.array(poses)), ())
+    trajectory = Trajectory(np.array(moments), np.array(poses))
+    return Odometry("kiss-icp", trajectory, (), deskewed=not deskew)

@@ -59,8 +59,9 @@ class LoamOptions:
     n_planar: planar points a turn to register to the map, about.
     scan_rounds, map_rounds: how often partners are looked for, at most.
     tolerance: metres; a direction whose pose would be less certain is degenerate.
-    deskew: whether the points were measured while the sensor moved; None tries both on the first
-        turns where the log has no time per point, and is True else.
+    deskew: whether the points were measured while the sensor moved (else all of a turn are of its
+        stamp); None tries both on the first turns where the log has no time per point, and is True
+        else.
     """
 
     voxel: float | None = None
@@ -128,6 +129,8 @@ class Loam:
     def add(self, scan: Scan) -> None:
         """Take in the next turn."""
         turn = arrange(scan)
+        if self.options.deskew is False:  # all of it is of one moment already
+            turn = replace(turn, moment=scan.stamp)
         if not self.poses:
             self._begin(turn)
             self._stamp = scan.stamp

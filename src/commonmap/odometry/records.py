@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from commonmap.types import Float64s, Trajectory
+from commonmap.odometry.geometry import at_its_stamp, complete_scans
+from commonmap.types import Float64s, Scan, Trajectory
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,12 +86,19 @@ class Odometry:
 
     method: row of `ODOMETRY`. trajectory: one pose a turn, at its `moment`; the map frame is the
     sensor's at the first pose, not level. health: one a turn. notes: what the user should know.
+    deskewed: the points of each turn are taken to be of one moment already, its stamp.
     """
 
     method: str
     trajectory: Trajectory
     health: tuple[ScanHealth, ...]
     notes: tuple[str, ...] = field(default=())
+    deskewed: bool = False
+
+    def as_taken(self, scans: Iterable[Scan]) -> Iterator[Scan]:
+        """Yield the turns with the rings and times with which their poses were found."""
+        for scan in complete_scans(scans, []):
+            yield at_its_stamp(scan) if self.deskewed else scan
 
     @property
     def n_lost(self) -> int:

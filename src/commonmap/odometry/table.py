@@ -26,12 +26,11 @@ log = logging.getLogger(__name__)
 class OdometryMethod:
     """A row of the table.
 
-    run: takes scans (ring and time per point), the options, the progress and the notes on what was
-        derived of the scans; gives the answer.
+    run: takes scans (ring and time per point), the options and the progress; gives the answer.
     extra: the optional package it needs, empty for none. needs_poses: poses must be given.
     """
 
-    run: Callable[[Iterable[Scan], LoamOptions, Progress, list[str]], Odometry] | None
+    run: Callable[[Iterable[Scan], LoamOptions, Progress], Odometry] | None
     summary: str
     extra: str = ""
     needs_poses: bool = False
@@ -72,10 +71,10 @@ def estimate(
     assert row.run is not None
     notes: list[str] = []
     completed = complete_scans(check_order(scans), notes)
-    answer = row.run(completed, options or LoamOptions(), progress, notes)
+    answer = row.run(completed, options or LoamOptions(), progress)
     for note in notes:
         log.warning("%s", note)
-    return Odometry(answer.method, answer.trajectory, answer.health, (*notes, *answer.notes))
+    return replace(answer, notes=(*notes, *answer.notes))
 
 
 def check_order(scans: Iterable[Scan]) -> Iterator[Scan]:
@@ -102,20 +101,31 @@ def check_order(scans: Iterable[Scan]) -> Iterator[Scan]:
 
 
 TRIAL_TURNS = 10
-"""Turns on which both readings of a log without times are tried."""
+MOST_TRIAL_TURNS = 60
+"""Turns on which both readings of a log without times are tried: more where the first cannot tell,
+as of a robot that stands."""
+
+CLEAR = 1.05
+"""Residuals of the two readings differ by this ratio where the turns tell them apart."""
 
 
-def estimate_loam(
-    scans: Iterable[Scan], options: LoamOptions, progress: Progress, derived: list[str]
-) -> Odometry:
-    """Return the trajectory by LOAM. derived: notes on what was derived of the scans so far."""
+def estimate_loam(scans: Iterable[Scan], options: LoamOptions, progress: Progress) -> Odometry:
+    """Return the trajectory by LOAM."""
     progress("odometry")
     stream = iter(scans)
     first = list(islice(stream, TRIAL_TURNS))
     notes: tuple[str, ...] = ()
-    if options.deskew is None and any("no time per point" in note for note in derived):
-        options, note = try_deskew(first, options)
-        notes = (note,)
+    if options.deskew is None and not all(scan.timed for scan in first):
+        trial = Trial(options)
+        trial.add(first)
+        while not trial.clear and len(first) < MOST_TRIAL_TURNS:
+            more = list(islice(stream, TRIAL_TURNS))
+            if not more:
+                break
+            trial.add(more)
+            first += more
+        options = replace(options, deskew=trial.deskew)
+        notes = (trial.tell(),)
     loam = Loam(options)
     for number, scan in enumerate(chain(first, stream)):
         loam.add(scan)
@@ -123,28 +133,53 @@ def estimate_loam(
             progress(f"odometry, {number + 1} turns")
     trajectory = Trajectory(np.array(loam.moments), np.array(loam.poses))
     notes += describe_health(loam.health)
-    return Odometry("loam", trajectory, tuple(loam.health), notes)
+    deskewed = options.deskew is False
+    return Odometry("loam", trajectory, tuple(loam.health), notes, deskewed)
 
 
-def try_deskew(first: list[Scan], options: LoamOptions) -> tuple[LoamOptions, str]:
-    """Return the options with `deskew` set as the first turns fit better, and a note on it.
+class Trial:
+    """Whether turns without times were measured while the sensor moved, or moved to one moment by
+    whoever made the log: both readings go through LOAM, and the one whose features lie closer to
+    the map is taken."""
 
-    A log without times may hold turns that its maker has already deskewed.
-    """
-    residual = []
-    for deskew in (True, False):
-        loam = Loam(replace(options, deskew=deskew))
-        for scan in first:
-            loam.add(scan)
-        known = [h.residual for h in loam.health[2:] if np.isfinite(h.residual)]
-        residual.append(float(np.mean(known)) if known else np.inf)
-    chosen = residual[0] < residual[1]
-    does = "deskewed here" if chosen else "taken as already deskewed"
-    note = (
-        f"the scans are {does}: features lie within {residual[0] * 1e3:.1f} mm of the map with "
-        f"deskewing by the derived times and within {residual[1] * 1e3:.1f} mm without"
-    )
-    return replace(options, deskew=chosen), note
+    def __init__(self, options: LoamOptions):
+        self._both = [Loam(replace(options, deskew=deskew)) for deskew in (True, False)]
+
+    def add(self, scans: Iterable[Scan]) -> None:
+        """Take in the next turns."""
+        for scan in scans:
+            for loam in self._both:
+                loam.add(scan)
+
+    @property
+    def residual(self) -> tuple[float, float]:
+        """Metres, the mean residual with deskewing by the derived times and without."""
+        found = []
+        for loam in self._both:
+            known = [h.residual for h in loam.health[2:] if np.isfinite(h.residual)]
+            found.append(float(np.mean(known)) if known else np.inf)
+        return found[0], found[1]
+
+    @property
+    def clear(self) -> bool:
+        """Whether one reading fits clearly better."""
+        here, given = self.residual
+        return not 1.0 / CLEAR < here / max(given, 1e-9) < CLEAR
+
+    @property
+    def deskew(self) -> bool:
+        """Whether the turns are to be deskewed."""
+        here, given = self.residual
+        return here < given
+
+    def tell(self) -> str:
+        """Return the decision as a sentence."""
+        here, given = self.residual
+        does = "deskewed here" if self.deskew else "taken as already deskewed"
+        return (
+            f"the scans are {does}: features lie within {here * 1e3:.1f} mm of the map with "
+            f"deskewing by the derived times and within {given * 1e3:.1f} mm without"
+        )
 
 
 def describe_health(health: Sequence[ScanHealth]) -> tuple[str, ...]:
@@ -202,7 +237,9 @@ def take_poses(scans: Iterable[Scan], poses: Trajectory, progress: Progress) -> 
     known = Trajectory(np.asarray(poses.time, np.float64), T)
     stamps, n_outside = [], 0
     first, last = np.inf, -np.inf
+    at_once = True  # points that all have the time of their turn were moved there
     for scan in scans:
+        at_once = at_once and float(np.ptp(scan.time)) == 0.0 if len(scan.time) else at_once
         stamps.append(scan.stamp)
         n_outside += not covers(known, scan)
         first = min(first, float(scan.time.min(initial=scan.stamp)))
@@ -213,7 +250,8 @@ def take_poses(scans: Iterable[Scan], poses: Trajectory, progress: Progress) -> 
             f"of {poses.time[0]:.3f} to {poses.time[-1]:.3f} s"
         )
     outside = f"{n_outside} of {len(stamps)} turns lie outside the time of the known poses"
-    return Odometry("poses", _cut(known, first, last), (), (outside,) if n_outside else ())
+    notes = (outside,) if n_outside else ()
+    return Odometry("poses", _cut(known, first, last), (), notes, deskewed=at_once)
 
 
 def _cut(known: Trajectory, first: float, last: float) -> Trajectory:
@@ -223,13 +261,11 @@ def _cut(known: Trajectory, first: float, last: float) -> Trajectory:
     return Trajectory(known.time[low:high], known.T_map_sensor[low:high])
 
 
-def _run_kiss_icp(
-    scans: Iterable[Scan], options: LoamOptions, progress: Progress, derived: list[str]
-) -> Odometry:
+def _run_kiss_icp(scans: Iterable[Scan], options: LoamOptions, progress: Progress) -> Odometry:
     """Return the trajectory by KISS-ICP; scans with derived times are not deskewed."""
     stream = iter(scans)
     first = list(islice(stream, 1))
-    deskew = not derived if options.deskew is None else options.deskew
+    deskew = all(scan.timed for scan in first) if options.deskew is None else options.deskew
     return estimate_kiss_icp(chain(first, stream), deskew=deskew, progress=progress)
 
 

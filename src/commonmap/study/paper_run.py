@@ -26,7 +26,6 @@ from commonmap.matching.search import Peaks
 from commonmap.matching.search_metric import search_metric
 from commonmap.merging.products import CommonMap
 from commonmap.odometry import TrajectoryErrors, compare, covers, georeference
-from commonmap.odometry.geometry import complete_scans
 from commonmap.pipeline import match_maps, merge_maps
 from commonmap.pipeline_logs import RobotMap
 from commonmap.sim.pairs import Plan, plan_missions
@@ -220,7 +219,7 @@ def make_octree(path: Path, robot: RobotMap, *, progress: Progress = no_progress
     trajectory, health = robot.trajectory, robot.odometry.health
 
     def chosen() -> Iterator[Scan]:
-        for number, scan in enumerate(complete_scans(iter_scans(path), [])):
+        for number, scan in enumerate(robot.odometry.as_taken(iter_scans(path))):
             lost = number < len(health) and health[number].lost
             if number % every == 0 and not lost and covers(trajectory, scan):
                 yield scan

@@ -215,7 +215,7 @@ def _read(file: Path, stamp: float, period: float, options: Options, teller: Tel
     kept = are_returns(xyz)
     if not kept.any():
         return None
-    xyz = xyz[kept]
+    xyz, timed = xyz[kept], time is not None
     teller.tell("its points name no channel: it is told from their order or elevation")
     ring = rings_of(xyz)
     if time is not None and not options.deskewed:
@@ -231,5 +231,5 @@ def _read(file: Path, stamp: float, period: float, options: Options, teller: Tel
         time = times_of(xyz, ring, stamp, period)
     return Scan(
         xyz=xyz, time=time, ring=ring, intensity=intensity[kept].astype(np.float32),
-        stamp=float(time.min()),
+        stamp=float(time.min()), timed=timed,
     )  # fmt: skip

@@ -152,7 +152,7 @@ class CloudReader:
         )
         return Scan(
             xyz=xyz[good], time=time[good], ring=ring[good], intensity=intensity[good],
-            stamp=float(time[good].min()),
+            stamp=float(time[good].min()), timed=_first(TIME_FIELDS, columns) is not None,
         )  # fmt: skip
 
     def _ring(
