@@ -1,12 +1,13 @@
 """How far the verdict can be trusted: collect simulated cases, fit the model, show what it does.
 
-    python benchmarks/decision.py collect --first 4000 --pairs 96  # appends to records/decision.jsonl
-    python benchmarks/decision.py fit                              # prints the weights for decide.py
-    python benchmarks/decision.py draw                             # docs/images/decision.png
-    python benchmarks/decision.py show [--from 4000]               # success, refusals, false accepts
+    python benchmarks/decision.py collect --first 4000 --pairs 96   # adds to records/decision.jsonl
+    python benchmarks/decision.py fit                               # the weights for decide.py
+    python benchmarks/decision.py draw                              # docs/images/decision.png
+    python benchmarks/decision.py show [--from 4000]                # right, refused, false accepts
 
 A case is a pair of robots in one simulated place (overlap 0.12 to 1, drift 0 to 1 %, tilt to 1
-degree, up to 30 % of the objects changed), or a draft of another place of the same or another kind.
+degree, up to 30 % of the objects changed), or a draft of another place of the same or another kind,
+or the base's own draft in a mirror: the same walls, stems and slopes, but no motion leads there.
 Every second case uses only heights under 1 m. Fit and show never use the same seeds: the fit takes
 those below 4000.
 """
@@ -42,10 +43,11 @@ KINDS = ("paper", "city", "forest", "village", "industrial", "field")
 RECORDS = Path(__file__).parent / "records" / "decision.jsonl"
 FIT_BELOW = 4000
 RIGHT = (1.0, np.radians(2.0))
+MIRRORED = "mirrored"
 
 
 def simulate(seed: int, cache: Path | None = None) -> dict[str, Any]:
-    """Return both maps, the truth and the conditions of a seed; kept in the cache if there is one."""
+    """Return both maps, the truth and the conditions of a seed; kept in the cache, if any."""
     path = cache / f"{seed}.npz" if cache else None
     if path is not None and path.exists():
         with np.load(path) as kept:
@@ -78,7 +80,8 @@ def simulate(seed: int, cache: Path | None = None) -> dict[str, Any]:
 
 def collect(first: int, n_pairs: int, n_others: int, cache: Path | None, share: str) -> None:
     """Append the cases of `n_pairs` seeds to the records: each base with its own draft, with
-    `n_others` drafts of other places of its kind, and with one of another kind.
+    `n_others` drafts of other places of its kind, with one of another kind, and with its own in
+    a mirror.
 
     share: "k/n", take only every n-th base from the k-th; several runs can share the work.
     """
@@ -86,17 +89,21 @@ def collect(first: int, n_pairs: int, n_others: int, cache: Path | None, share: 
     RECORDS.parent.mkdir(exist_ok=True)
     done = set()
     if RECORDS.exists():
-        done = {(r["seed"], r["draft"]) for r in load(first, first + n_pairs)}
+        kept = load(first, first + n_pairs)
+        done = {(r["seed"], r["draft"], r["label"] == MIRRORED) for r in kept}
     start_at, of = (int(part) for part in share.split("/"))
     for seed in range(first + start_at, first + n_pairs, of):
-        drafts = [seed, *(seed + len(KINDS) * (n + 1) for n in range(n_others)), seed + 1]
+        drafts = [seed, *(seed + len(KINDS) * (n + 1) for n in range(n_others)), seed + 1, seed]
         place = None
         for n, draft in enumerate(drafts):
             draft = first + (draft - first) % n_pairs
-            if (seed, draft) in done or (n and draft == seed):
+            mirrored = n == len(drafts) - 1
+            if (seed, draft, mirrored) in done or (n and draft == seed and not mirrored):
                 continue
             place = place or simulate(seed, cache)
             other = place if draft == seed else simulate(draft, cache)
+            if mirrored:
+                other = {**place, "source": place["source"] * [1.0, -1.0, 1.0], "mirrored": True}
             record = judge(place, other, seed, draft, 1.0 if (seed + n) % 2 else None)
             with RECORDS.open("a") as out:
                 out.write(json.dumps(record) + "\n")
@@ -114,7 +121,9 @@ def judge(
     found = match(place["target"], other["source"], config=config)
     kind = place["conditions"]["kind"]
     label = "same place"
-    if draft != seed:
+    if other.get("mirrored"):
+        label = MIRRORED
+    elif draft != seed:
         label = "same kind" if other["conditions"]["kind"] == kind else "other kind"
     record = {
         "version": __version__, "seed": seed, "draft": draft, "label": label,
@@ -122,7 +131,7 @@ def judge(
         "confidence": found.confidence, "cpu_seconds": time.process_time() - start,
         "figures": dict(found.evidence), "right": False,
     }  # fmt: skip
-    if draft == seed:
+    if label == "same place":
         best = found.T_target_source
         if best is None:
             best = found.rivals[0].T_target_source
@@ -185,7 +194,8 @@ def show(first: int) -> None:
     j = judged(first)
     p, accepted, right, same = j["p"], j["accepted"], j["right"], j["same"]
     print(f"{len(p)} cases, {same.sum()} of the same place, {(~same).sum()} of others")
-    print(f"same place: best pose right {right.sum()}, accepted and right {(accepted & right).sum()}")
+    both = (accepted & right).sum()
+    print(f"same place: best pose right {right.sum()}, accepted and right {both}")
     print(f"accepted and wrong: {(accepted & ~right).sum()}")
     for kind in KINDS:
         k = j["kind"] == kind
@@ -246,7 +256,8 @@ def draw(path: Path, first: int = FIT_BELOW) -> None:
 def main() -> None:
     """Run the command named on the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("job", nargs="?", default="show", choices=["collect", "fit", "show", "draw"])
+    jobs = ["collect", "fit", "show", "draw"]
+    parser.add_argument("job", nargs="?", default="show", choices=jobs)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--pairs", type=int, default=60)
     parser.add_argument("--others", type=int, default=5)
