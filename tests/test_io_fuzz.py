@@ -25,8 +25,12 @@ from commonmap.io import (
     write_geotiff,
     write_trajectory,
 )
+from commonmap.io.meshes import read_mesh
+from commonmap.io.octomap import BT_MAGIC, OT_MAGIC, read_scan_graph, write_octree
 from commonmap.io.scans import iter_scans, write_scans
+from commonmap.mapping.octree import Octree
 from commonmap.types import Cloud, Scan, Trajectory
+from test_world_files import triangle_glb
 
 N = 60
 RNG = np.random.default_rng(0)
@@ -110,6 +114,26 @@ def trajectory() -> bytes:
         return path.read_bytes()
 
 
+def octree(suffix: str) -> bytes:
+    tree = Octree(0.5)
+    tree.insert(np.zeros(3), RNG.uniform(-6, 6, (N, 3)))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"map{suffix}"
+        write_octree(path, tree.leaves())
+        return path.read_bytes()
+
+
+def scan_graph() -> bytes:
+    points = b"".join(struct.pack("<I3d", 3, *xyz) for xyz in XYZ.tolist())
+    pose = struct.pack("<I3dI4d", 3, 1, 2, 3, 4, 1, 0, 0, 0)
+    return struct.pack("<I", 2) + 2 * (struct.pack("<I", N) + points + pose + bytes(4))
+
+
+def wavefront() -> bytes:
+    corners = "".join(f"v {x} {y} {z}\n" for x, y, z in XYZ.tolist())
+    return (corners + "".join(f"f {k} {k + 1}/3/4 -1\n" for k in range(1, N - 1))).encode()
+
+
 FILES: dict[str, tuple[str, Callable[[], bytes], Callable[[Path], object]]] = {
     **{suffix: (suffix, lambda s=suffix: written(s), read_map)  # type: ignore[misc]
        for suffix in (".las", ".laz", ".ply", ".pcd", ".csv", ".npy", ".npz")},
@@ -120,6 +144,11 @@ FILES: dict[str, tuple[str, Callable[[], bytes], Callable[[Path], object]]] = {
     "compressed pcd": (".pcd", compressed_pcd, read_map),
     "geotiff": (".tif", raster, read_geotiff),
     "tum": (".tum", trajectory, read_trajectory),
+    "ot": (".ot", lambda: octree(".ot"), read_map),
+    "bt": (".bt", lambda: octree(".bt"), read_map),
+    "scan graph": (".graph", scan_graph, read_scan_graph),
+    "obj": (".obj", wavefront, read_mesh),
+    "glb": (".glb", triangle_glb, read_mesh),
 }  # fmt: skip
 
 
@@ -172,7 +201,8 @@ def test_damaged_files_give_a_map_or_a_known_error(kind: str, tmp_path: Path) ->
 def test_any_bytes_behind_a_true_beginning(kind: str, data: bytes) -> None:
     suffix, _, read = FILES[kind]
     start = {".las": b"LASF", ".laz": b"LASF", ".ply": b"ply\nformat ", ".pcd": b"VERSION 0.7\n",
-             ".npy": b"\x93NUMPY\x01\x00", ".npz": b"PK\x03\x04", ".tif": b"II*\0"}  # fmt: skip
+             ".npy": b"\x93NUMPY\x01\x00", ".npz": b"PK\x03\x04", ".tif": b"II*\0",
+             ".ot": OT_MAGIC, ".bt": BT_MAGIC, ".glb": b"glTF\2\0\0\0"}  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"map{suffix}"
         path.write_bytes(start.get(suffix, b"") + data)

@@ -171,7 +171,9 @@ def read_scan_graph(path: str | Path) -> list[GraphScan]:
             raise InputError(
                 f"{path}: a point of a scan graph has 3 coordinates; one says otherwise"
             )
-        scans.append((points["xyz"].astype(np.float32), reader.pose()))
+        with np.errstate(over="ignore"):  # what no float holds is not finite, as in OctoMap
+            xyz = points["xyz"].astype(np.float32)
+        scans.append((xyz, reader.pose()))
         reader.take(4)
     return [GraphScan(xyz, T) for xyz, T in scans]
 
