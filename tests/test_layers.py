@@ -21,7 +21,7 @@ LAYERS = (
     ("pipeline", "pipeline_logs", "demo"),
     (
         "study", "report", "cli", "cli_beside", "cli_logs", "cli_octree", "cli_progress",
-        "cli_results", "cli_study", "__init__",
+        "cli_results", "cli_study", "__init__", "__main__",
     ),
 )  # fmt: skip
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
