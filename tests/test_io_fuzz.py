@@ -16,7 +16,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from commonmap.errors import CommonmapError
+from commonmap.errors import CommonmapError, InputError
 from commonmap.io import (
     read_geotiff,
     read_map,
@@ -209,6 +209,14 @@ def test_any_bytes_behind_a_true_beginning(kind: str, data: bytes) -> None:
         with pytest.raises(CommonmapError):
             read(path)
             raise CommonmapError("read as a map: fine too")
+
+
+def test_a_pose_of_a_scan_graph_has_a_rotation(tmp_path: Path) -> None:
+    none = struct.pack("<I3dI4d", 3, 1, 2, 3, 4, 0, 0, 0, 0)
+    point = struct.pack("<II3d", 1, 3, 1, 2, 3)
+    (tmp_path / "a.graph").write_bytes(struct.pack("<I", 1) + point + none + bytes(4))
+    with pytest.raises(InputError, match="a finite position and a quaternion"):
+        read_scan_graph(tmp_path / "a.graph")
 
 
 def test_a_member_of_an_archive_takes_no_more_than_its_file_holds(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -110,6 +111,19 @@ def test_rasters_that_are_refused(tmp_path: Path, change: dict[str, object], wor
     with pytest.raises(InputError, match=words):
         write_geotiff(tmp_path / "a.tif", **given)  # type: ignore[arg-type]
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_raster_takes_no_more_than_its_file_can_hold(tmp_path: Path) -> None:
+    path = tmp_path / "heights.tif"
+    write_geotiff(path, {"height": np.zeros((3, 2))}, origin=(0, 0), cell=0.5)
+    data = bytearray(path.read_bytes())
+    at = data.rindex(struct.pack("<HHI", 257, 3, 1))  # tag ImageLength
+    data[at + 8 : at + 12] = struct.pack("<HH", 60_000, 0)
+    at = data.rindex(struct.pack("<HHI", 256, 3, 1))  # tag ImageWidth
+    data[at + 8 : at + 12] = struct.pack("<HH", 60_000, 0)
+    path.write_bytes(data)
+    with pytest.raises(InputError, match="1 layers of 60000 x 60000 cells, more than its"):
+        read_geotiff(path)
 
 
 def test_what_is_no_raster(tmp_path: Path) -> None:

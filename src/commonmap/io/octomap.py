@@ -203,6 +203,12 @@ class _Reader:
         dims_q, u, qx, qy, qz = struct.unpack("<I4d", self.take(36))
         if dims != 3 or dims_q != 4:
             raise InputError(f"{self.path}: a pose of a scan graph is 3 + 4 numbers; this is not")
+        length = float(np.linalg.norm([qx, qy, qz, u]))
+        if not (np.isfinite([x, y, z, length]).all() and length > 0.0):
+            raise InputError(
+                f"{self.path}: a pose of a scan graph is a finite position and a quaternion; "
+                f"{(x, y, z)} and (w, x, y, z) = {(u, qx, qy, qz)} came"
+            )
         return from_quaternion((x, y, z), (qx, qy, qz, u))
 
 

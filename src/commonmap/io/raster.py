@@ -16,6 +16,10 @@ from commonmap.io.source import log, look, parsing
 from commonmap.types import GridMap
 
 
+MOST_CELLS_A_BYTE = 1100
+"""What compression can pack into a byte at most, of cells of a byte each (deflate: 1032)."""
+
+
 def write_geotiff(
     path: PathLike,
     layers: Mapping[str, NDArray[Any]],
@@ -80,7 +84,7 @@ def read_geotiff(path: PathLike) -> tuple[GridMap, str | None]:
     (`band1`, ... where a band has none); nodata becomes NaN. A raster that is turned, or whose
     cells are not square, raises `InputError`.
     """
-    path, _, _ = look(path)
+    path, size, _ = look(path)
     import rasterio
     from rasterio.errors import NotGeoreferencedWarning
 
@@ -92,6 +96,12 @@ def read_geotiff(path: PathLike) -> tuple[GridMap, str | None]:
             if not square or T.b != 0 or T.d != 0:
                 raise InputError(
                     f"{path} must be north up with square cells; its transform is {tuple(T)[:6]}"
+                )
+            cells = raster.width * raster.height * raster.count
+            if cells > MOST_CELLS_A_BYTE * size:
+                raise InputError(
+                    f"{path} is damaged: it promises {raster.count} layers of {raster.width} x "
+                    f"{raster.height} cells, more than its {size} bytes can hold"
                 )
             layers: dict[str, NDArray[np.float32]] = {}
             for band in range(1, raster.count + 1):
