@@ -24,7 +24,7 @@ test: $(WITH_TESTS)
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
 
 check: $(WITH_TESTS)
-	$(BIN)/ruff check src tests
+	$(BIN)/ruff check src tests benchmarks
 	$(BIN)/ruff format --check src tests
 	$(BIN)/mypy
 

@@ -33,10 +33,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
+from commonmap.errors import CommonmapError
 from fuzzing import LOGS, POSE_FILES, Victim, jobs_on_log, jobs_on_poses
 from test_io_fuzz import FILES
-
-from commonmap.errors import CommonmapError
 
 RECORDS = Path(__file__).parent / "records"
 ROOM = 64 << 20

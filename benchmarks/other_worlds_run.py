@@ -19,11 +19,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from other_worlds import KINDS, World, build
 from scipy.spatial.transform import Rotation
 
 from commonmap.frames import apply, difference, fit_motion, from_rotation, invert
 from commonmap.matching.match import match
-from other_worlds import KINDS, World, build
 
 RECORDS = Path(__file__).parent / "records" / "other_worlds.jsonl"
 

@@ -5,8 +5,8 @@
     python benchmarks/peers.py table                   # writes the tables into README and docs
 
 Every run is a process of its own on one core, with a limit of 120 s of CPU time. Its answer goes,
-with all that is known about it, as one line into `records/peers.jsonl.xz`; lines are added and never
-rewritten. `--python` names a second interpreter for the peers whose libraries this one lacks
+with all that is known about it, as one line into `records/peers.jsonl.xz`; lines are added and
+never rewritten. `--python` names a second interpreter for the peers whose libraries this one lacks
 (`pip install kiss-matcher open3d map-closures small_gicp` there). Who can run nowhere is skipped,
 and the reason is shown. The pairs (`peers_pairs.py`) are made once and kept in `--folder`.
 

@@ -1,6 +1,6 @@
 """Does the coarse-to-fine search find what the exhaustive search finds? And at what price?
 
-    python benchmarks/search_recovery.py [--first 0] [--places 12] [--crops 18] [--out benchmarks/records]
+    python benchmarks/search_recovery.py [--first 0] [--places 12] [--crops 18] [--out FOLDER]
 
 Two robots are simulated in each place (all six kinds, a drift of 0.3 %, 30 % of the movable things
 changed); square crops of the draft, 12 to 30 m wide, anywhere and turned anyhow, are searched for
@@ -56,7 +56,8 @@ def crops(place: int, n: int) -> Iterator[tuple[dict[str, Any], SlabGrid, SlabGr
         cell = max(cell, 0.5)
         layers = [build_layers(item, cell, edges, max_height) for item in (base, draft)]
         if all(each.grid["slab_occupied"].any() for each in layers):
-            yield case | {"cell": cell, "under_1_m": bool(crop % 2)}, layers[0].slabs, layers[1].slabs
+            case |= {"cell": cell, "under_1_m": bool(crop % 2)}
+            yield case, layers[0].slabs, layers[1].slabs
 
 
 def exhaustive(target: SlabGrid, source: SlabGrid, fast: SearchPlan) -> SearchPlan:
@@ -122,8 +123,8 @@ def show(records: list[dict[str, Any]]) -> None:
           f"{len(elsewhere)} of them elsewhere; {higher} scored higher; {ratio:.1f} times as fast "
           "(median of CPU time)")
     for r in missed:
-        print(f"  {r['kind']} {r['width']:.0f} m: {r['score']:.0f} instead of {r['exhaustive']:.0f}, "
-              f"{r['metres_apart']:.1f} m away")
+        print(f"  {r['kind']} {r['width']:.0f} m: {r['score']:.0f} instead of "
+              f"{r['exhaustive']:.0f}, {r['metres_apart']:.1f} m away")
 
 
 if __name__ == "__main__":

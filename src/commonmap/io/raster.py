@@ -15,7 +15,6 @@ from commonmap.io.atomic import PathLike, writing
 from commonmap.io.source import log, look, parsing
 from commonmap.types import GridMap
 
-
 MOST_CELLS_A_BYTE = 1100
 """What compression can pack into a byte at most, of cells of a byte each (deflate: 1032)."""
 
