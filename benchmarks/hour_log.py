@@ -6,7 +6,7 @@
 
 A drone circles over a village, a round a minute (radius 30 m, 20 m up, lidar 45 deg down, sway).
 One round is simulated, three of four firings left out to spare time; the capture repeats its
-packets with the time going on, over the full hour, as the clocks of the sensor and of the host would.
+packets with the time going on, over the full hour, as the clocks of sensor and host would.
 `map_log` reads it twice, as `commonmap odometry LOG -o way.tum --cloud map.laz` does: once for the
 way, once for the map. Resident memory is noted every 100 turns. No loop is closed: what the
 odometry has drifted by at the end of each round is told as well.
