@@ -23,7 +23,8 @@ import numpy as np
 from commonmap.errors import MissingExtraError
 from commonmap.matching.arrays import find_arrays
 from commonmap.matching.correlate import prepare_target, score_surface
-from commonmap.matching.evidence import evidence_surface, pack_slabs, transform_target
+from commonmap.matching.evidence import evidence_surface, transform_target
+from commonmap.matching.slabs import pack_slabs
 
 RECORD = Path(__file__).parent / "records" / "gpu.json"
 

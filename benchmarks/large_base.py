@@ -34,8 +34,8 @@ import scipy
 from numpy.typing import NDArray
 
 from commonmap.config import ComputeConfig
-from commonmap.matching.evidence import SlabGrid
 from commonmap.matching.search import Peaks, plan_search, search
+from commonmap.matching.slabs import SlabGrid
 
 RECORD = Path(__file__).parent / "records" / "large_base.json"
 FIGURE = Path(__file__).parent.parent / "docs" / "images" / "large_base.png"

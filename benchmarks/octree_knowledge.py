@@ -30,11 +30,11 @@ from commonmap.config import Config
 from commonmap.frames import apply, difference, invert
 from commonmap.mapping.octree import Octree
 from commonmap.mapping.octree_columns import octree_columns
-from commonmap.matching.evidence import SlabGrid, pack_slabs
 from commonmap.matching.figures import other_poses
 from commonmap.matching.maps import Layers, Prepared, build_layers, choose_grid, prepare
 from commonmap.matching.match import least_overlap
 from commonmap.matching.search import search
+from commonmap.matching.slabs import SlabGrid, pack_slabs
 from commonmap.sim.pairs import simulate_pair
 from commonmap.types import Bools, Cloud
 

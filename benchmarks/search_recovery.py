@@ -25,10 +25,10 @@ import numpy as np
 
 from commonmap.config import Config
 from commonmap.frames import apply, from_xyz_yaw
-from commonmap.matching.evidence import SlabGrid
 from commonmap.matching.maps import build_layers, choose_grid, prepare
 from commonmap.matching.match import least_overlap
 from commonmap.matching.search import Peaks, SearchPlan, plan_search, search
+from commonmap.matching.slabs import SlabGrid
 from commonmap.sim.pairs import simulate_pair
 
 KINDS = ("paper", "city", "forest", "village", "industrial", "field")

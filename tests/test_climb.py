@@ -9,8 +9,8 @@ import pytest
 
 from commonmap.config import ComputeConfig
 from commonmap.matching.climb import HERE, climb_all, pack_planes, starts_around
-from commonmap.matching.evidence import Columns, SlabGrid, list_columns, pack_slabs
 from commonmap.matching.search import evidence_at
+from commonmap.matching.slabs import Columns, SlabGrid, list_columns, pack_slabs
 from commonmap.matching.tiles import find_level
 from commonmap.types import Bools, Float64s
 

@@ -11,23 +11,25 @@ from hypothesis import strategies as st
 
 from commonmap.matching.arrays import NUMPY
 from commonmap.matching.evidence import (
-    Columns,
-    SlabGrid,
-    coarsen,
     count_tables,
     evidence_surface,
-    list_columns,
-    pack_slabs,
-    scatter,
     signed_evidence,
     sum_table,
     transform_target,
     uncertainty,
-    unpack,
     weigh,
     xlogx_table,
 )
 from commonmap.matching.search import evidence_at
+from commonmap.matching.slabs import (
+    Columns,
+    SlabGrid,
+    coarsen,
+    list_columns,
+    pack_slabs,
+    scatter,
+    unpack,
+)
 from commonmap.matching.support import measure_support
 from commonmap.metrics.formulas import evidence_direct, mutual_information
 from commonmap.metrics.table import METRICS

@@ -9,7 +9,6 @@ import pytest
 
 from commonmap.mapping.ground import find_ground
 from commonmap.mapping.height_map import build_height_map
-from commonmap.matching.evidence import Columns, SlabGrid, list_columns, pack_slabs
 from commonmap.matching.search import (
     Peaks,
     SearchPlan,
@@ -19,6 +18,7 @@ from commonmap.matching.search import (
     separate,
 )
 from commonmap.matching.search_metric import scatter_heights, search_metric
+from commonmap.matching.slabs import Columns, SlabGrid, list_columns, pack_slabs
 from commonmap.matching.tiles import local_maxima
 from commonmap.types import Float64s, Floats, GridMap
 from matching_scenes import apart, look, make_place, moved, rigid
@@ -106,7 +106,7 @@ def test_no_pose_of_a_grid_beats_the_answer(seed: int) -> None:
 
 def coarse(grid: SlabGrid) -> SlabGrid:
     """Return the grid on twice its cell."""
-    from commonmap.matching.evidence import coarsen
+    from commonmap.matching.slabs import coarsen
 
     return coarsen(grid, 2)
 

@@ -7,7 +7,8 @@ import pytest
 
 from commonmap.matching.correlate import prepare_target, score_surface
 from commonmap.matching.direct import direct_surface
-from commonmap.matching.evidence import evidence_surface, pack_slabs, transform_target
+from commonmap.matching.evidence import evidence_surface, transform_target
+from commonmap.matching.slabs import pack_slabs
 from commonmap.metrics.table import METRICS
 from commonmap.study import metrics_scores
 from commonmap.study.metrics_scores import COLUMNS

@@ -17,19 +17,18 @@ from commonmap.cli import app
 from commonmap.config import ComputeConfig, Config
 from commonmap.errors import InputError, MissingExtraError
 from commonmap.matching import tiles
-from commonmap.matching.evidence import (
+from commonmap.matching.evidence import evidence_surface, transform_target
+from commonmap.matching.search import Peaks, plan_search, search
+from commonmap.matching.slabs import (
     Columns,
     SlabGrid,
     coarse_shape,
     coarse_window,
     coarsen,
-    evidence_surface,
     list_columns,
     pack_slabs,
     scatter,
-    transform_target,
 )
-from commonmap.matching.search import Peaks, plan_search, search
 from commonmap.matching.tiles import (
     Sweep,
     Task,

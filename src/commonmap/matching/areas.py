@@ -29,7 +29,6 @@ from commonmap.matching.drift import (
     find_surface,
     smooth,
 )
-from commonmap.matching.evidence import SlabGrid
 from commonmap.matching.figures import (
     lift_mirrored,
     measure_figures,
@@ -48,6 +47,7 @@ from commonmap.matching.maps import (
 )
 from commonmap.matching.refine import lift, refine
 from commonmap.matching.search import Peaks, search
+from commonmap.matching.slabs import SlabGrid
 from commonmap.types import (
     Area,
     Areas,

@@ -20,15 +20,8 @@ import numpy as np
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from commonmap.matching.evidence import (
-    Bits,
-    Columns,
-    SlabGrid,
-    is_shared,
-    sum_table,
-    weigh,
-    xlogx_table,
-)
+from commonmap.matching.evidence import is_shared, sum_table, weigh, xlogx_table
+from commonmap.matching.slabs import Bits, Columns, SlabGrid
 from commonmap.matching.tiles import Level
 from commonmap.types import Float64s
 

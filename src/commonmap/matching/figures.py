@@ -9,11 +9,11 @@ import numpy as np
 from commonmap.frames import apply
 from commonmap.mapping.points import sample
 from commonmap.matching.decide import Figures
-from commonmap.matching.evidence import coarsen, list_columns
 from commonmap.matching.inliers import share_of_inliers
 from commonmap.matching.maps import Layers, Points, Prepared
 from commonmap.matching.refine import Refined
 from commonmap.matching.search import Peaks, centre_columns, evidence_at
+from commonmap.matching.slabs import coarsen, list_columns
 from commonmap.matching.support import measure_support
 from commonmap.types import Bools, Float64s
 

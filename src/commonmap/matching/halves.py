@@ -9,14 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from commonmap.matching.evidence import (
-    Columns,
-    SlabGrid,
-    coarsen,
-    list_columns,
-)
 from commonmap.matching.figures import other_poses
 from commonmap.matching.search import Peaks, centre_columns, evidence_at, search
+from commonmap.matching.slabs import Columns, SlabGrid, coarsen, list_columns
 from commonmap.types import Bools, Float64s
 
 LEAST_COLUMNS = 40

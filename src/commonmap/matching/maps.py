@@ -14,7 +14,7 @@ from commonmap.mapping.height_map import build_height_map, choose_cell, choose_s
 from commonmap.mapping.level import MOST_POINTS as LEVEL_POINTS
 from commonmap.mapping.level import Levelling, find_level, no_levelling
 from commonmap.mapping.points import bounds, inside_box, move, points_of, sample, thin
-from commonmap.matching.evidence import SlabGrid, pack_slabs
+from commonmap.matching.slabs import SlabGrid, pack_slabs
 from commonmap.metrics.table import METRICS
 from commonmap.types import Bools, Cloud, Float64s, GridMap, Leaves
 

@@ -13,14 +13,7 @@ from commonmap.config import Config
 from commonmap.errors import EmptyMapError, InputError
 from commonmap.frames import apply, invert
 from commonmap.matching.decide import NOTHING, Figures, Verdict, decide
-from commonmap.matching.evidence import (
-    SlabGrid,
-    coarsen,
-    evidence_surface,
-    list_columns,
-    scatter,
-    transform_target,
-)
+from commonmap.matching.evidence import evidence_surface, transform_target
 from commonmap.matching.figures import other_poses
 from commonmap.matching.maps import (
     Layers,
@@ -32,6 +25,7 @@ from commonmap.matching.maps import (
 from commonmap.matching.refine import Refined, lift
 from commonmap.matching.search import Peaks, centre_columns, plan_search, search
 from commonmap.matching.search_metric import search_metric
+from commonmap.matching.slabs import SlabGrid, coarsen, list_columns, scatter
 from commonmap.matching.verify import Maps, both, verify
 from commonmap.metrics.table import METRICS
 from commonmap.types import (

@@ -19,16 +19,8 @@ from commonmap.config import ComputeConfig
 from commonmap.frames import from_xyz_yaw
 from commonmap.matching.arrays import find_rim
 from commonmap.matching.climb import HERE, climb_all, starts_around
-from commonmap.matching.evidence import (
-    Columns,
-    SlabGrid,
-    coarsen,
-    count_tables,
-    list_columns,
-    sum_table,
-    weigh,
-    xlogx_table,
-)
+from commonmap.matching.evidence import count_tables, sum_table, weigh, xlogx_table
+from commonmap.matching.slabs import Columns, SlabGrid, coarsen, list_columns
 from commonmap.matching.tiles import (
     Level,
     Sweep,

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from commonmap.matching.evidence import Columns, SlabGrid
+from commonmap.matching.slabs import Columns, SlabGrid
 from commonmap.types import Float64s
 
 

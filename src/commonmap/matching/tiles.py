@@ -24,20 +24,17 @@ from scipy import fft
 from commonmap.config import ComputeConfig
 from commonmap.errors import InputError, MissingExtraError
 from commonmap.matching.arrays import find_arrays
-from commonmap.matching.evidence import (
+from commonmap.matching.evidence import Spectra, evidence_surface, rounding, transform_target
+from commonmap.matching.slabs import (
     Bits,
     Columns,
     Range,
     SlabGrid,
-    Spectra,
     coarse_origin,
     coarse_shape,
     coarse_window,
     coarsen,
-    evidence_surface,
-    rounding,
     scatter,
-    transform_target,
 )
 from commonmap.types import Float64s, Progress
 

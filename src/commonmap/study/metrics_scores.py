@@ -17,15 +17,9 @@ import numpy as np
 import scipy.fft
 
 from commonmap.matching.arrays import NUMPY
-from commonmap.matching.evidence import (
-    Bits,
-    SlabGrid,
-    Spectra,
-    evidence_surface,
-    transform_target,
-    xlogx_table,
-)
+from commonmap.matching.evidence import Spectra, evidence_surface, transform_target, xlogx_table
 from commonmap.matching.roads import Frame, Products, moment_products
+from commonmap.matching.slabs import Bits, SlabGrid
 from commonmap.metrics.plans import MinSum, Moments, Smooth, Sums, Term
 from commonmap.metrics.table import METRICS, quantise
 from commonmap.study.metrics_kernels import (

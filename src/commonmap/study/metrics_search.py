@@ -10,7 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from commonmap.matching.evidence import (
+from commonmap.matching.search import count_yaws, separate
+from commonmap.matching.search_metric import scatter_heights
+from commonmap.matching.slabs import (
     SlabGrid,
     coarse_origin,
     coarse_shape,
@@ -18,8 +20,6 @@ from commonmap.matching.evidence import (
     pack_slabs,
     scatter,
 )
-from commonmap.matching.search import count_yaws, separate
-from commonmap.matching.search_metric import scatter_heights
 from commonmap.study.metrics_kernels import best_peaks, vertex
 from commonmap.study.metrics_scores import COLUMNS, prepare, score_all
 from commonmap.types import Float64s, GridMap

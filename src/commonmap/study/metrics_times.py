@@ -7,7 +7,8 @@ import time
 import numpy as np
 
 from commonmap.matching.correlate import prepare_target, score_surface
-from commonmap.matching.evidence import evidence_surface, pack_slabs, transform_target
+from commonmap.matching.evidence import evidence_surface, transform_target
+from commonmap.matching.slabs import pack_slabs
 from commonmap.metrics.table import METRICS
 
 TARGET, SOURCE, SLABS, REPEATS = 128, 64, 5, 5
