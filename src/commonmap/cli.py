@@ -18,15 +18,34 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
+from commonmap.cli_options import (
+    Area,
+    Base,
+    ConfigFile,
+    Deskewed,
+    Draft,
+    KeepPartial,
+    Level,
+    MaxHeight,
+    Metric,
+    Model,
+    OdometryMethod,
+    Poses,
+    Quiet,
+    Resolution,
+    Scheduler,
+    Seed,
+    Topic,
+)
 from commonmap.cli_study import study_app
+from commonmap.cli_words import in_words, say_errors, say_match
 from commonmap.errors import CommonmapError, InputError
 from commonmap.version import __version__
 
 if TYPE_CHECKING:
     from commonmap.cli_logs import Input
     from commonmap.config import Config
-    from commonmap.odometry import TrajectoryErrors
-    from commonmap.types import Cloud, Leaves, Match
+    from commonmap.types import Cloud, Leaves
 
 USAGE_ERROR: Any = typer.BadParameter.__mro__[2]
 """What click raises for a wrong command line; newer releases of typer bring their own click."""
@@ -43,59 +62,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.add_typer(study_app, name="study")
-
-Base = Annotated[
-    Path, typer.Argument(metavar="BASE", help="The map whose frame stays (the drone's).")
-]
-Draft = Annotated[Path, typer.Argument(metavar="DRAFT", help="The map to be placed (the robot's).")]
-Metric = Annotated[str | None, typer.Option(help="Similarity metric; see `commonmap metrics`.")]
-MaxHeight = Annotated[
-    float | None, typer.Option(help="Use only what is less than this above ground, metres.")
-]
-Resolution = Annotated[float | None, typer.Option(help="Cell and voxel size, metres.")]
-Level = Annotated[str | None, typer.Option(metavar="auto|off", help="Level maps without gravity.")]
-Area = Annotated[
-    float | None,
-    typer.Option(metavar="METRES", help="Match each area of the draft by itself; find its drift."),
-]
-Seed = Annotated[int | None, typer.Option(help="Seed where chance enters.")]
-ConfigFile = Annotated[
-    Path | None,
-    typer.Option("--config", help="Configuration, .json or .toml; options win over it."),
-]
-OdometryMethod = Annotated[
-    str | None,
-    typer.Option("--odometry", metavar="loam|poses|kiss-icp", help="Raw logs: how to find poses."),
-]
-Poses = Annotated[
-    list[Path] | None,
-    typer.Option(
-        "--poses", help="Raw logs: known poses (TUM, KITTI, bag, topic), one a log, in order."
-    ),
-]
-Topic = Annotated[
-    list[str] | None, typer.Option("--topic", help="Raw logs: topic of the scans, one a log.")
-]
-KeepPartial = Annotated[
-    bool, typer.Option("--keep-partial", help="Raw logs: keep what can be read of a damaged one.")
-]
-Model = Annotated[
-    str | None,
-    typer.Option(metavar="NAME", help="Raw packets that do not say it: model of the Velodyne."),
-]
-Deskewed = Annotated[
-    bool | None,
-    typer.Option(
-        "--deskewed/--not-deskewed",
-        help="Raw logs without times: whether each turn was moved to one moment.",
-        show_default="looked for",
-    ),
-]
-Scheduler = Annotated[
-    str | None,
-    typer.Option(metavar="tcp://HOST:PORT", help="Search on the workers of a Dask scheduler."),
-]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
 
 
 def main() -> NoReturn:
@@ -181,7 +147,7 @@ def run_command(
                 robots=(target.robot, source.robot),
             )  # fmt: skip
     if not quiet:
-        _say_match(result.match)
+        say_match(result.match)
         print(f"written: {out}/ ({', '.join(names)})")
     return 0 if result.match.accepted else REFUSED
 
@@ -235,7 +201,7 @@ def match_command(
     else:
         cli_results.write_json(out, values)
         if not quiet:
-            _say_match(found)
+            say_match(found)
             print(f"written: {out}")
     return 0 if found.accepted else REFUSED
 
@@ -337,7 +303,7 @@ def odometry_command(
             f"degenerate in {robot.odometry.n_degenerate}"
         )
         if errors is not None:
-            _say_errors("trajectory", errors)
+            say_errors("trajectory", errors)
         print("written: " + ", ".join(str(path) for path in (out, cloud) if path is not None))
     return 0
 
@@ -462,8 +428,8 @@ def demo_command(
     if not quiet:
         print(note)
         for name, errors in zip(names, shown.errors, strict=True):
-            _say_errors(name, errors)
-        _say_match(shown.result.match)
+            say_errors(name, errors)
+        say_match(shown.result.match)
         if error is not None:
             print(f"from the truth: {error[0]:.3f} m, {math.degrees(error[1]):.3f} degrees")
         print(f"report: {(out / 'report.html').resolve()}")
@@ -537,7 +503,7 @@ def info_command(
         return 0
     width = max(len(name) for name in values)
     for name, value in values.items():
-        print(f"{name.replace('_', ' '):<{width}}  {_in_words(value)}")
+        print(f"{name.replace('_', ' '):<{width}}  {in_words(value)}")
     return 0
 
 
@@ -601,63 +567,6 @@ def _take_both(base: Path, draft: Path, progress: Any, **options: Any) -> tuple[
     for one in each:
         one.chosen()
     return cli_beside.take_both([base, draft], each, progress)
-
-
-def _say_errors(name: str, errors: TrajectoryErrors) -> None:
-    print(
-        f"{name}: {errors.way:.0f} m, absolute error {errors.ape:.3f} m (most "
-        f"{errors.ape_max:.3f}), relative {100 * errors.relative:.2f} % and "
-        f"{math.degrees(errors.turn):.4f} deg/m over {errors.stretch:.0f} m"
-    )
-
-
-def _say_match(match: Match) -> None:
-    from commonmap.frames import apply, invert
-    from commonmap.report.pose import pose_figures, sigma_figures
-
-    print(match.reason)
-    if match.areas is not None:
-        n_areas = sum(area.T_target_source is not None for area in match.areas.items)
-        print(f"{n_areas} areas by themselves: {100 * match.areas.agreeing:.0f} % find that pose")
-        print(f"drift: {match.areas.reason}")
-    if match.T_target_source is None:
-        return
-    pose = pose_figures(match.T_target_source)
-    print(f"draft's origin in base: x {pose.x:.3f} m, y {pose.y:.3f} m, z {pose.z:.3f} m")
-    if match.covariance_centre is not None:
-        # Far from its origin a small turn moves a map by much: say where the map itself lies
-        here = match.covariance_centre
-        there = apply(invert(match.T_target_source), here[None])[0]
-        print(
-            "  the draft's point {:.2f}, {:.2f}, {:.2f} lies at {:.2f}, {:.2f}, {:.2f}".format(
-                *there, *here
-            )
-        )
-    print(
-        f"  yaw {pose.yaw_deg:.3f}, pitch {pose.pitch_deg:.3f}, roll {pose.roll_deg:.3f} degrees; "
-        f"confidence {math.floor(1000 * match.confidence) / 10:.1f} %, "
-        f"overlap {100 * match.overlap:.0f} %"
-    )
-    if match.covariance is not None:
-        s = sigma_figures(match.covariance)
-        print(
-            f"  one sigma: {s.x:.3f}, {s.y:.3f}, {s.z:.3f} m; "
-            f"yaw {s.yaw_deg:.3f}, pitch {s.pitch_deg:.3f}, roll {s.roll_deg:.3f} degrees"
-        )
-
-
-def _in_words(value: Any) -> str:
-    if value is None:
-        return "none"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, int):
-        return f"{value:,}".replace(",", " ")
-    if isinstance(value, float):
-        return f"{value:.6g}" if abs(value) < 1e5 else f"{value:.3f}"
-    if isinstance(value, list):
-        return ", ".join(_in_words(item) for item in value) or "none"
-    return str(value)
 
 
 def _size(map_: Cloud | Leaves) -> int:

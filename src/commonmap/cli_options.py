@@ -1,0 +1,61 @@
+"""The arguments and options that several commands share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+Base = Annotated[
+    Path, typer.Argument(metavar="BASE", help="The map whose frame stays (the drone's).")
+]
+Draft = Annotated[Path, typer.Argument(metavar="DRAFT", help="The map to be placed (the robot's).")]
+Metric = Annotated[str | None, typer.Option(help="Similarity metric; see `commonmap metrics`.")]
+MaxHeight = Annotated[
+    float | None, typer.Option(help="Use only what is less than this above ground, metres.")
+]
+Resolution = Annotated[float | None, typer.Option(help="Cell and voxel size, metres.")]
+Level = Annotated[str | None, typer.Option(metavar="auto|off", help="Level maps without gravity.")]
+Area = Annotated[
+    float | None,
+    typer.Option(metavar="METRES", help="Match each area of the draft by itself; find its drift."),
+]
+Seed = Annotated[int | None, typer.Option(help="Seed where chance enters.")]
+ConfigFile = Annotated[
+    Path | None,
+    typer.Option("--config", help="Configuration, .json or .toml; options win over it."),
+]
+OdometryMethod = Annotated[
+    str | None,
+    typer.Option("--odometry", metavar="loam|poses|kiss-icp", help="Raw logs: how to find poses."),
+]
+Poses = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--poses", help="Raw logs: known poses (TUM, KITTI, bag, topic), one a log, in order."
+    ),
+]
+Topic = Annotated[
+    list[str] | None, typer.Option("--topic", help="Raw logs: topic of the scans, one a log.")
+]
+KeepPartial = Annotated[
+    bool, typer.Option("--keep-partial", help="Raw logs: keep what can be read of a damaged one.")
+]
+Model = Annotated[
+    str | None,
+    typer.Option(metavar="NAME", help="Raw packets that do not say it: model of the Velodyne."),
+]
+Deskewed = Annotated[
+    bool | None,
+    typer.Option(
+        "--deskewed/--not-deskewed",
+        help="Raw logs without times: whether each turn was moved to one moment.",
+        show_default="looked for",
+    ),
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(metavar="tcp://HOST:PORT", help="Search on the workers of a Dask scheduler."),
+]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
