@@ -185,16 +185,19 @@ def run_child(which: str, resolution: float, n: int, budget: float) -> None:
         start = time.perf_counter()
         tree.write(Path(folder) / "map.ot")
         write_seconds = time.perf_counter() - start
-        content = (Path(folder) / "map.ot").read_bytes()
+        peak_written = _peak_mb() - before
+        file_bytes = (Path(folder) / "map.ot").stat().st_size
+        with open(Path(folder) / "map.ot", "rb") as file:
+            sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     figures = {
         "scans": len(cpu),
         "cpu_seconds": cpu,
         "wall_seconds": wall,
         "peak_mb": peak,
-        "peak_mb_written": _peak_mb() - before,
+        "peak_mb_written": peak_written,
         "write_seconds": write_seconds,
-        "file_bytes": len(content),
-        "sha256": hashlib.sha256(content).hexdigest(),
+        "file_bytes": file_bytes,
+        "sha256": sha256,
         **tree.figures(),
     }
     print(json.dumps(figures))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import struct
 import subprocess
 from collections.abc import Iterable
 from pathlib import Path
@@ -14,8 +15,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from commonmap.io.octomap import read_scan_graph, write_octree
+from commonmap.io.octomap import GraphScan, read_scan_graph, write_octree
 from commonmap.mapping.octree import Octree
 from octree_oracles import room_scan
 
@@ -35,31 +38,57 @@ def run(*command: object) -> str:
     return done.stdout + done.stderr
 
 
-@pytest.fixture(scope="module")
-def graph(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a scan graph of six scans in a room, made by OctoMap from a text log.
-
-    The sensor moves and does not turn: how OctoMap rounds a rotation is its own.
-    """
+@pytest.fixture(scope="module", params=[0.0, 1.0], ids=["straight", "turning"])
+def graph(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a scan graph of six scans in a room, made by OctoMap from a text log."""
     folder = tmp_path_factory.mktemp("graph")
     rng = np.random.default_rng(9)
     lines = []
     for k in range(6):
         origin = np.array([0.4 * k, -0.2 * k, 1.5])
-        lines.append(f"NODE {origin[0]} {origin[1]} {origin[2]} 0 0 0")
-        lines += ["{:.6f} {:.6f} {:.6f}".format(*p) for p in (room_scan(origin, rng) - origin)[::3]]
+        angles = request.param * k * np.array([0.02, -0.03, 0.3])
+        R = Rotation.from_euler("xyz", angles).as_matrix()
+        lines.append("NODE " + " ".join(str(value) for value in (*origin, *angles)))
+        points = (room_scan(origin, rng) - origin)[::3] @ R
+        lines += ["{:.6f} {:.6f} {:.6f}".format(*p) for p in points]
     (folder / "room.log").write_text("\n".join(lines) + "\n")
     run("log2graph", folder / "room.log", folder / "room.graph")
     return folder / "room.graph"
+
+
+def quaternions(graph: Path, scans: list[GraphScan]) -> list[NDArray[np.float32]]:
+    """Return w, x, y, z of each pose as the file has them, in single precision as OctoMap."""
+    data, at, found = graph.read_bytes(), 4, []
+    for scan in scans:
+        at += 4 + 28 * len(scan.xyz) + 28 + 4  # points, translation, and how many numbers follow
+        found.append(np.array(struct.unpack_from("<4d", data, at), np.float32))
+        at += 32 + 4
+    return found
+
+
+def turn(q: NDArray[np.float32], xyz: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return points (N, 3) turned by q as OctoMap does: `q v q^-1` in single precision."""
+
+    def multiply(a: Any, b: Any) -> Any:
+        (u, x, y, z), (U, X, Y, Z) = a, b
+        return (
+            u * U - x * X - y * Y - z * Z, y * Z - Y * z + u * X + U * x,
+            z * X - Z * x + u * Y + U * y, x * Y - X * y + u * Z + U * z,
+        )  # fmt: skip
+
+    right = multiply(q, (np.zeros(len(xyz), np.float32), *xyz.T))
+    turned: NDArray[np.float32] = np.stack(multiply(right, q * np.float32([1, -1, -1, -1]))[1:], 1)
+    return turned
 
 
 def tree_of(graph: Path, numbers: Iterable[int], **how: Any) -> Octree:
     """Return our tree of some scans of a graph."""
     tree = Octree(RESOLUTION)
     scans = read_scan_graph(graph)
+    q = quaternions(graph, scans)
     for number in numbers:
         t = scans[number].T_map_sensor[:3, 3].astype(np.float32)
-        tree.insert(t, scans[number].xyz + t, **how)
+        tree.insert(t, turn(q[number], scans[number].xyz) + t, **how)
     return tree
 
 
