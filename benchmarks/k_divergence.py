@@ -190,7 +190,7 @@ def main() -> None:
     parser.add_argument("--yaws", type=int, default=180)
     parser.add_argument("--sample", type=int, default=1800)
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--tolerance", type=float, default=9e-6)
+    parser.add_argument("--tolerance", type=float, default=9.9e-6)
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "records")
     options = parser.parse_args()
     records = [

@@ -267,6 +267,11 @@ def _over_x_and_y(row: Float64s, K: int) -> Float64s:
     return E
 
 
+BETWEEN, UNMIXED, CUT, LITTLE = 0.05, 0.6, 0.27, 0.08
+"""Shares of the tolerance for the interpolation in g, for its mixtures, for the singular values and
+for the products that are dropped. A mixture less saves a transform back of every surface."""
+
+
 @lru_cache(maxsize=64)
 def separate(
     expansion: Expansion,
@@ -284,7 +289,7 @@ def separate(
     omega, K = expansion.omega, expansion.omega.size
     middle, half = 0.5 * (g_range[0] + g_range[1]), 0.5 * (g_range[1] - g_range[0])
     nodes = 2 if half > 0.0 and linear else 1
-    while half > 0.0 and interpolation_error(expansion, half, nodes) > 0.2 * tolerance:
+    while half > 0.0 and interpolation_error(expansion, half, nodes) > BETWEEN * tolerance:
         nodes += 1
         if nodes > MAX_NODES:
             raise InputError(
@@ -301,7 +306,7 @@ def separate(
         mix = left[:, :n_mixed]
         aside = rows - np.einsum("ml,nl,nk->mk", mix, mix, rows)
         unmixed = float(_bound_rows(aside, omega, d).sum()) if n_mixed < nodes else 0.0
-        if unmixed <= 0.2 * tolerance:
+        if unmixed <= UNMIXED * tolerance:
             break
     louder = np.abs(mix).sum(axis=0)  # a bound of each mixture over g, as |T_m| <= 1
 
@@ -311,7 +316,7 @@ def separate(
     exact = [_over_x_and_y(row, K) for row in np.einsum("ml,mk->lk", mix, rows)]
     over_y = np.concatenate([E @ few_y for E in exact], axis=1)
     left, size, right = np.linalg.svd(np.einsum("kn,km->nm", few_x, over_y), full_matrices=False)
-    cut = 0.4 * tolerance
+    cut = CUT * tolerance
     for rank in range(1, 2 * K + 2):
         source = np.einsum("km,rm->rk", over_y, right[:rank] / size[:rank, None])
         onto = np.einsum("nr,kn->rk", left[:, :rank], few_x)
@@ -333,7 +338,7 @@ def separate(
     reach = _bound_rows(flat, omega, y).reshape(-1, rank) * _bound_rows(source, omega, x)
     reach = reach * louder[:, None]
     order = np.argsort(reach, axis=None, kind="stable")
-    n_dropped = int(np.searchsorted(np.cumsum(reach.ravel()[order]), 0.2 * tolerance))
+    n_dropped = int(np.searchsorted(np.cumsum(reach.ravel()[order]), LITTLE * tolerance))
     matter = np.ones(reach.size, np.bool_)
     matter[order[:n_dropped]] = False
     little = float(reach.ravel()[order[:n_dropped]].sum())

@@ -15,6 +15,9 @@ from commonmap.matching.roads import Frame, Products, norm
 from commonmap.metrics.plans import Smooth
 from commonmap.types import Bools, Float64s
 
+AT_ONCE = 8
+"""Layers of the target that are expanded together: more would take more memory and no less time."""
+
 
 @dataclass(frozen=True, eq=False)
 class Kernel:
@@ -32,7 +35,8 @@ def _split(
     width = high - low
     half_width = max(width - g0, width + g1)
     expansion = expand(psi, half_width, 0.4 * tolerance)
-    return separate(expansion, (low, high), (low, high), (g0, g1), 0.6 * tolerance, linear)
+    rest = tolerance - expansion.error
+    return separate(expansion, (low, high), (low, high), (g0, g1), rest, linear)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -41,6 +45,7 @@ def _fill_waves(
 ) -> None:  # pragma: no cover
     """out[r] = rows[r] . [cos(k step x), sin(k step x), x] h^power, x = ln h - centre."""
     K = (rows.shape[1] - 1) // 2
+    wave = np.empty(rows.shape[1])
     for i in range(h.shape[0]):
         for j in range(h.shape[1]):
             if not known[i, j]:
@@ -48,15 +53,16 @@ def _fill_waves(
             x = np.log(h[i, j]) - centre
             scale = h[i, j] ** power
             c1, s1 = np.cos(step * x), np.sin(step * x)
-            c, s = 1.0, 0.0
-            for r in range(rows.shape[0]):
-                out[r, i, j] = rows[r, 2 * K] * x
+            c, s = scale, 0.0
             for k in range(K):
-                for r in range(rows.shape[0]):
-                    out[r, i, j] += rows[r, k] * c + rows[r, K + k] * s
+                wave[k], wave[K + k] = c, s
                 c, s = c * c1 - s * s1, s * c1 + c * s1
+            wave[2 * K] = scale * x
             for r in range(rows.shape[0]):
-                out[r, i, j] *= scale
+                total = 0.0
+                for k in range(rows.shape[1]):
+                    total += rows[r, k] * wave[k]
+                out[r, i, j] = total
 
 
 def kernel_products(
@@ -82,20 +88,20 @@ def kernel_products(
     def layers(h: Float64s, known: Bools) -> Float64s:
         return expand_layers(h, known, separated.source, plan.alpha)
 
-    spectra, norms = [], []
-    pairs: list[tuple[tuple[int, int], ...]] = []
-    for m, some in enumerate(separated.pairs):
-        first = sum(len(earlier) for earlier in pairs)
-        pairs.append(tuple((p, first + k) for k, p in enumerate(some)))
-        if not some:
-            continue
-        stack = expand_layers(height_t, known_t, separated.target[m, list(some)], plan.beta)
-        spectra.append(fourier.pack(frame.arrays, frame.target_spectra(stack, workers)))
-        norms.append(norm(stack))
-    W = frame.arrays.xp.concatenate(spectra)
-    return Kernel(
-        plan, Products(frame, layers, W, tuple(pairs), np.concatenate(norms), "kernel"), separated
-    )
+    listed = [(m, p) for m, some in enumerate(separated.pairs) for p in some]
+    number = {pair: w for w, pair in enumerate(listed)}
+    pairs = tuple(tuple((p, number[m, p]) for p in some) for m, some in enumerate(separated.pairs))
+    rows = separated.target[tuple(np.array(listed).T)]
+    norms = np.empty(len(rows))
+    W: Array = None
+    for start in range(0, len(rows), AT_ONCE):
+        chunk = slice(start, start + AT_ONCE)
+        stack = expand_layers(height_t, known_t, rows[chunk], plan.beta)
+        packed = fourier.pack(frame.arrays, frame.target_spectra(stack, workers))
+        if W is None:  # joined at the end they would be copied once more
+            W = frame.arrays.xp.empty((len(rows), *packed.shape[1:]), packed.dtype)
+        W[chunk], norms[chunk] = packed, norm(stack)
+    return Kernel(plan, Products(frame, layers, W, pairs, norms, "kernel"), separated)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -114,38 +120,45 @@ def _evaluate_compiled(
 ) -> None:  # pragma: no cover
     nodes, n_mixed = mix.shape
     width = A.shape[1]
-    f, x = np.empty((nodes, width), values.dtype), np.zeros(width, values.dtype)
-    b1, b2 = np.empty(width, values.dtype), np.empty(width, values.dtype)
-    two = x.dtype.type(2.0)
+    T = np.empty((nodes + 3, width), values.dtype)  # Chebyshev's polynomials; three rows to fill up
+    T[nodes:] = 0.0
+    padded = np.zeros((nodes + 3, n_mixed), values.dtype)
+    padded[:nodes] = mix
+    x, f, total = np.empty(width, T.dtype), np.empty(width, T.dtype), np.empty(width, T.dtype)
+    one, two = x.dtype.type(1.0), x.dtype.type(2.0)
+    origin, scale = x.dtype.type(middle), x.dtype.type(1.0 / half if half > 0.0 else 0.0)
     for i in range(A.shape[0]):
         if not counted[i].any():
             out[i] = np.nan
             continue
-        if half > 0.0:
+        for j in range(width):
+            x[j] = (g[i, j] - origin) * scale
+        for j in range(width):  # outside of the range nothing is counted
+            x[j] = one if x[j] > one else (-one if x[j] < -one else x[j])
+        T[0] = one
+        if nodes > 1:
+            T[1] = x
+        for m in range(2, nodes):
             for j in range(width):
-                x[j] = min(1.0, max(-1.0, (g[i, j] - middle) / half))
-        f[:] = 0.0
+                T[m, j] = two * x[j] * T[m - 1, j] - T[m - 2, j]
+        total[:] = 0.0
         for k in range(n_mixed):
-            for m in range(nodes):
-                factor = mix[m, k]
+            f[:] = 0.0
+            for m in range(0, nodes, 4):  # four at a time: the sum stays in registers longer
+                a, b, c, d = padded[m, k], padded[m + 1, k], padded[m + 2, k], padded[m + 3, k]
+                Ta, Tb, Tc, Td = T[m], T[m + 1], T[m + 2], T[m + 3]
                 for j in range(width):
-                    f[m, j] += factor * values[k, i, j]
-        b1[:] = 0.0
-        b2[:] = 0.0
-        for m in range(nodes - 1, 0, -1):
+                    f[j] += a * Ta[j] + b * Tb[j] + c * Tc[j] + d * Td[j]
             for j in range(width):
-                b = two * x[j] * b1[j] - b2[j] + f[m, j]
-                b2[j] = b1[j]
-                b1[j] = b
+                total[j] += f[j] * values[k, i, j]
         for j in range(width):
             if not counted[i, j]:
                 out[i, j] = np.nan
                 continue
-            total = x[j] * b1[j] - b2[j] + f[0, j]
             if beta == 0.0:
-                out[i, j] = total / A[i, j] if alpha == 1.0 else total
+                out[i, j] = total[j] / A[i, j] if alpha == 1.0 else total[j]
             else:
-                out[i, j] = total / (A[i, j] ** alpha * B[i, j] ** beta)
+                out[i, j] = total[j] / (A[i, j] ** alpha * B[i, j] ** beta)
 
 
 def evaluate_kernel(
@@ -153,7 +166,7 @@ def evaluate_kernel(
 ) -> Array:
     """Return `sum P^alpha Q^beta (psi + linear)(s)` from the outputs, where counted; else NaN.
 
-    Chebyshev's polynomials of g = ln(A / B) are summed by Clenshaw's recurrence. g is as precise as
+    Chebyshev's polynomials of g = ln(A / B) follow from each other. g is as precise as
     the transforms: single precision moves the score by 1e-7 or so, far below their rounding.
     """
     separated, plan = kernel.separated, kernel.plan
