@@ -77,7 +77,9 @@ def turn(q: NDArray[np.float32], xyz: NDArray[np.float32]) -> NDArray[np.float32
         )  # fmt: skip
 
     right = multiply(q, (np.zeros(len(xyz), np.float32), *xyz.T))
-    turned: NDArray[np.float32] = np.stack(multiply(right, q * np.float32([1, -1, -1, -1]))[1:], 1)
+    turned: NDArray[np.float32] = np.stack(
+        multiply(right, q * np.array([1, -1, -1, -1], np.float32))[1:], 1
+    )
     return turned
 
 
