@@ -1,6 +1,7 @@
 """How far accepted poses are off where nothing drifts, and whether their covariance says so.
 
-    python benchmarks/pose_errors.py [--first 6000] [--pairs 240]
+    python benchmarks/pose_errors.py [--first 6500] [--pairs 220]
+    python benchmarks/pose_errors.py --share 0/2        # every second seed; another run takes 1/2
 
 Every seed is a pair without drift of one of the six kinds of place; overlap, tilt and change are
 drawn as in `decision.py`, at half its points. Of every accepted pose the error (metres, radians, at
@@ -64,14 +65,16 @@ def run(seed: int) -> dict[str, Any]:
 def main() -> None:
     """Run the pairs, keep a line of each, and print the quantiles."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--first", type=int, default=6000)
-    parser.add_argument("--pairs", type=int, default=240)
+    parser.add_argument("--first", type=int, default=6500)
+    parser.add_argument("--pairs", type=int, default=220)
+    parser.add_argument("--share", default="0/1")
     options = parser.parse_args()
     logging.getLogger("commonmap").setLevel(logging.ERROR)
     done = []
     if RECORDS.exists():
         done = [json.loads(line) for line in RECORDS.read_text().splitlines()]
-    for seed in range(options.first, options.first + options.pairs):
+    start, step = (int(part) for part in options.share.split("/"))
+    for seed in range(options.first + start, options.first + options.pairs, step):
         if any(r["seed"] == seed for r in done):
             continue
         done.append(run(seed))
