@@ -71,3 +71,15 @@ def test_run_merges_only_what_is_accepted(monkeypatch: pytest.MonkeyPatch) -> No
     refused = replace(ready, accepted=False, T_target_source=None)
     monkeypatch.setattr(pipeline, "match", lambda *a, **k: refused)
     assert pipeline.run(xyz, xyz).common is None
+
+
+def test_maps_that_share_no_cell_are_merged_with_a_warning(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    yard = np.random.default_rng(3).uniform(0, 8, (4000, 3)) * [1.0, 1.0, 0.1]
+    near, far = np.eye(4), np.eye(4)
+    far[0, 3] = 50.0
+    pipeline.merge_maps(yard, yard, near)
+    assert "seen by both" not in caplog.text
+    pipeline.merge_maps(yard, yard, far)
+    assert "no cell of the common map was seen by both" in caplog.text

@@ -5,6 +5,7 @@ No file is opened here: maps come in, answers go out.
 
 from __future__ import annotations
 
+import logging
 import time
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,6 +21,8 @@ from commonmap.matching.areas import match_areas
 from commonmap.matching.match import match
 from commonmap.merging.free_space import free_height_layer
 from commonmap.merging.products import (
+    SOURCE,
+    TARGET,
     CommonMap,
     Map,
     choose_octree_origin,
@@ -31,6 +34,8 @@ from commonmap.merging.products import (
 )
 from commonmap.metrics.table import find_metric
 from commonmap.types import Cloud, DriftField, Leaves, Match, Progress, no_progress
+
+log = logging.getLogger("commonmap")
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +116,11 @@ def merge_maps(
         heights, leaves=tree.leaves, octree_origin=octree_origin, config=config.merge
     )
     seen_by = tree.provenance.astype(np.uint8)
+    if not np.any(heights.layers["seen_by"] == TARGET | SOURCE):
+        log.warning(
+            "no cell of the common map was seen by both: is the pose of the draft's frame in the "
+            "base's, and were the maps not moved since?"
+        )
     return CommonMap(cloud, tree.leaves, seen_by, tree.conflict, octree_origin, heights, navigation)
 
 
