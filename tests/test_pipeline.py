@@ -73,7 +73,7 @@ def test_run_merges_only_what_is_accepted(monkeypatch: pytest.MonkeyPatch) -> No
     assert pipeline.run(xyz, xyz).common is None
 
 
-def test_maps_that_share_no_cell_are_merged_with_a_warning(
+def test_maps_that_share_no_voxel_are_merged_with_a_warning(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     yard = np.random.default_rng(3).uniform(0, 8, (4000, 3)) * [1.0, 1.0, 0.1]
@@ -82,4 +82,4 @@ def test_maps_that_share_no_cell_are_merged_with_a_warning(
     pipeline.merge_maps(yard, yard, near)
     assert "seen by both" not in caplog.text
     pipeline.merge_maps(yard, yard, far)
-    assert "no cell of the common map was seen by both" in caplog.text
+    assert "no voxel of the common map was seen by both" in caplog.text

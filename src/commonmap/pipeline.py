@@ -116,9 +116,9 @@ def merge_maps(
         heights, leaves=tree.leaves, octree_origin=octree_origin, config=config.merge
     )
     seen_by = tree.provenance.astype(np.uint8)
-    if not np.any(heights.layers["seen_by"] == TARGET | SOURCE):
+    if not np.any(seen_by == TARGET | SOURCE):
         log.warning(
-            "no cell of the common map was seen by both: is the pose of the draft's frame in the "
+            "no voxel of the common map was seen by both: is the pose of the draft's frame in the "
             "base's, and were the maps not moved since?"
         )
     return CommonMap(cloud, tree.leaves, seen_by, tree.conflict, octree_origin, heights, navigation)
