@@ -1,6 +1,6 @@
 """How far the verdict can be trusted: collect simulated cases, fit the model, show what it does.
 
-    python benchmarks/decision.py collect --first 4000 --pairs 96   # adds to records/decision.jsonl
+    python benchmarks/decision.py collect --first 4000 --pairs 96   # adds to the records
     python benchmarks/decision.py fit                               # the weights for decide.py
     python benchmarks/decision.py draw                              # docs/images/decision.png
     python benchmarks/decision.py show [--from 4000]                # right, refused, false accepts
@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import lzma
 import time
 from pathlib import Path
 from typing import Any
@@ -40,7 +41,7 @@ from commonmap.sim.pairs import simulate_pair
 from commonmap.version import __version__
 
 KINDS = ("paper", "city", "forest", "village", "industrial", "field")
-RECORDS = Path(__file__).parent / "records" / "decision.jsonl"
+RECORDS = Path(__file__).parent / "records" / "decision.jsonl.xz"
 FIT_BELOW = 4000
 RIGHT = (1.0, np.radians(2.0))
 MIRRORED = "mirrored"
@@ -105,7 +106,7 @@ def collect(first: int, n_pairs: int, n_others: int, cache: Path | None, share: 
             if mirrored:
                 other = {**place, "source": place["source"] * [1.0, -1.0, 1.0], "mirrored": True}
             record = judge(place, other, seed, draft, 1.0 if (seed + n) % 2 else None)
-            with RECORDS.open("a") as out:
+            with lzma.open(RECORDS, "at", encoding="utf-8") as out:
                 out.write(json.dumps(record) + "\n")
             print(seed, draft, record["kind"], record["label"], record["max_height"],
                   "accepted" if record["accepted"] else "refused",
@@ -143,7 +144,8 @@ def judge(
 
 def load(first: int, last: int) -> list[dict[str, Any]]:
     """Return the records of the seeds from `first` up to, not including, `last`."""
-    records = [json.loads(line) for line in RECORDS.read_text().splitlines()]
+    with lzma.open(RECORDS, "rt", encoding="utf-8") as lines:
+        records = [json.loads(line) for line in lines]
     return [r for r in records if first <= r["seed"] < last]
 
 
