@@ -48,10 +48,6 @@ Crowns and hedges are entered by rays: what one robot sees of them lies on its o
 other's on the other. Such a shift is common to all patches, so none of them tells of it."""
 
 
-STANDING = 0.5
-"""Normals whose z is less than this are of what stands, not of the ground."""
-
-
 @dataclass(frozen=True, eq=False)
 class Surface:
     """A target to register on. points, normals: (N, 3). tree: of the points."""
@@ -119,20 +115,12 @@ def measure_covariance(
     spreads = [_spread(pairs, n) for n in PATCHES]
     sizes = [float(np.trace(K_inverse @ B)) for B in spreads]
     B = np.mean(spreads, axis=0) * (max(sizes) / max(float(np.mean(sizes)), 1e-300))
-    covariance = K_inverse @ B @ K_inverse + SMALLEST + _common(pairs)
+    covariance = K_inverse @ B @ K_inverse + SMALLEST + _common(pairs.scale)
     return np.asarray(0.5 * (covariance + covariance.T))
 
 
-def _common(pairs: Pairs) -> Float64s:
-    """Return the covariance (6, 6) of a level shift that all loose surfaces have in common.
-
-    Only what stands holds a level shift: on a field that is the bushes, not the flat ground that
-    nearly all pairs lie on.
-    """
-    standing = np.abs(pairs.J[:, 2]) < STANDING
-    scale = pairs.scale
-    if np.count_nonzero(standing) >= 20:
-        scale = 1.4826 * float(np.median(np.abs(pairs.r[standing])))
+def _common(scale: float) -> Float64s:
+    """Return the covariance (6, 6) of a level shift that all loose surfaces have in common."""
     loose = max(scale**2 - FLAT**2, 0.0)
     return np.asarray(np.diag([COMMON**2 * loose] * 2 + [0.0] * 4))
 
