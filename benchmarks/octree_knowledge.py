@@ -6,7 +6,8 @@ Two robots are simulated in one place; the rays of both go into octrees. The occ
 column are the same in all ways of looking at it, what counts as *not occupied* is not:
 
     points   a column that holds any point is known in all slabs (what `match` does)
-    octree   a slab is known where the octree saw at least half of it free, or it is occupied
+    octree   a slab is known where the octree saw at least half of it free, or it is occupied (what
+             `match` does with `--rays`)
     seen     both: a slab of a column with points counts only where the octree saw it free
     either   one or the other: free columns without a point are known too
 
@@ -27,39 +28,18 @@ from typing import Any
 import numpy as np
 
 from commonmap.config import Config
-from commonmap.frames import apply, difference, invert
-from commonmap.mapping.octree import Octree
-from commonmap.mapping.octree_columns import octree_columns
+from commonmap.frames import difference, invert
 from commonmap.matching.figures import other_poses
-from commonmap.matching.maps import Layers, Prepared, build_layers, choose_grid, prepare
+from commonmap.matching.maps import Layers, build_layers, choose_grid, prepare
 from commonmap.matching.match import least_overlap
 from commonmap.matching.search import search
+from commonmap.matching.seen_free import see_free
 from commonmap.matching.slabs import SlabGrid, pack_slabs
 from commonmap.sim.pairs import simulate_pair
-from commonmap.types import Bools, Cloud
+from commonmap.types import Bools
 
 KINDS = ("forest", "village", "industrial", "city", "field", "paper")
 WAYS = ("points", "octree", "seen", "either")
-
-
-def see_free(item: Prepared, cloud: Cloud, layers: Layers, cell: float) -> Bools:
-    """Return (n_slabs, nx, ny), what an octree of the cloud's rays saw free of the layers' grid."""
-    tree = Octree(0.5 * cell)
-    ends, starts = (apply(item.T_prepared_map, xyz) for xyz in (cloud.xyz, cloud.origin))
-    turn = np.floor((cloud.time - cloud.time.min()) / 0.1).astype(int)
-    order = np.argsort(turn, kind="stable")
-    for part in np.split(order, np.flatnonzero(np.diff(turn[order])) + 1):
-        tree.insert(starts[part], ends[part], discretize=True)
-    grid = layers.grid
-    n_x, n_y = grid["known"].shape
-    i, j = np.indices((n_x, n_y)).reshape(2, -1)
-    middle = grid.origin + (np.column_stack([i, j]) + 0.5) * grid.cell
-    ground = item.ground.height_at(middle).reshape(n_x, n_y)
-    columns = octree_columns(
-        tree.leaves(), grid.origin, grid.cell, (n_x, n_y), ground=ground,
-        slab_edges=grid.slab_edges,
-    )  # fmt: skip
-    return np.asarray(columns["free_share"] >= 0.5)
 
 
 def slabs_of(way: str, layers: Layers, free: Bools) -> SlabGrid:
@@ -88,9 +68,10 @@ def run(seed: int) -> dict[str, Any]:
     cell, edges, max_height = choose_grid(*items, config)
     layers = [build_layers(item, cell, edges, max_height) for item in items]
     free = [
-        see_free(item, cloud, each, cell)
+        see_free(each, cloud, item)
         for item, cloud, each in zip(items, clouds, layers, strict=True)
     ]
+    assert free[0] is not None and free[1] is not None
     T_true = items[0].T_prepared_map @ pair.T_target_source @ invert(items[1].T_prepared_map)
     middle = items[1].xyz.mean(axis=0)
     record: dict[str, Any] = {

@@ -32,6 +32,7 @@ from commonmap.cli_options import (
     OdometryMethod,
     Poses,
     Quiet,
+    Rays,
     Resolution,
     Scheduler,
     Seed,
@@ -112,6 +113,7 @@ def run_command(
     max_height: MaxHeight = None,
     resolution: Resolution = None,
     level: Level = None,
+    rays: Rays = False,
     area: Area = None,
     seed: Seed = None,
     config: ConfigFile = None,
@@ -128,7 +130,7 @@ def run_command(
 
     BASE and DRAFT are maps (clouds, octrees) or raw logs of a lidar (pcap, bag, mcap, folder).
     """
-    settings = _settings(config, metric, max_height, resolution, level, seed, scheduler, area)
+    settings = _settings(config, metric, max_height, resolution, level, seed, scheduler, area, rays)
     from commonmap import cli_results, pipeline
     from commonmap.cli_progress import telling
 
@@ -163,6 +165,7 @@ def match_command(
     max_height: MaxHeight = None,
     resolution: Resolution = None,
     level: Level = None,
+    rays: Rays = False,
     area: Area = None,
     seed: Seed = None,
     config: ConfigFile = None,
@@ -179,7 +182,7 @@ def match_command(
 
     BASE and DRAFT are maps (clouds, octrees) or raw logs of a lidar (pcap, bag, mcap, folder).
     """
-    settings = _settings(config, metric, max_height, resolution, level, seed, scheduler, area)
+    settings = _settings(config, metric, max_height, resolution, level, seed, scheduler, area, rays)
     from commonmap import cli_results, pipeline
     from commonmap.cli_progress import telling
     from commonmap.report.pose import to_json
@@ -523,7 +526,7 @@ def metrics_command() -> int:
 def _settings(
     file: Path | None, metric: str | None, max_height: float | None, resolution: float | None,
     level: str | None, seed: int | None, scheduler: str | None = None,
-    area: float | None = None,
+    area: float | None = None, rays: bool = False,
 ) -> Config:  # fmt: skip
     """Return the configuration of a file with the options of the command line on top."""
     from dataclasses import replace
@@ -531,7 +534,7 @@ def _settings(
     from commonmap.config import Config, read_config
 
     config = (read_config(file) if file is not None else Config()).with_values(
-        grid={"resolution": resolution, "max_height": max_height},
+        grid={"resolution": resolution, "max_height": max_height, "rays": rays or None},
         level={"mode": level},
         search={"metric": metric},
         areas={"size": area},

@@ -15,6 +15,12 @@ Metric = Annotated[str | None, typer.Option(help="Similarity metric; see `common
 MaxHeight = Annotated[
     float | None, typer.Option(help="Use only what is less than this above ground, metres.")
 ]
+Rays = Annotated[
+    bool,
+    typer.Option(
+        "--rays", help="What rays saw free, and no more, counts as known (logs, octrees)."
+    ),
+]
 Resolution = Annotated[float | None, typer.Option(help="Cell and voxel size, metres.")]
 Level = Annotated[str | None, typer.Option(metavar="auto|off", help="Level maps without gravity.")]
 Area = Annotated[

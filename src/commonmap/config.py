@@ -28,10 +28,13 @@ class GridConfig:
     resolution: edge of a cell; None takes it from the density of the sparser map.
     max_height: only what is less than this above ground is used (1 m is the paper's set-up);
         None uses all heights.
+    rays: where a map has them (ray origins, or free space of an octree), they say what of it is
+        known; else a column with points is known at all heights. The verdict was fitted without.
     """
 
     resolution: float | None = None
     max_height: float | None = None
+    rays: bool = False
 
     def __post_init__(self) -> None:
         _require_positive("grid.resolution", self.resolution)

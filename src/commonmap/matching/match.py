@@ -25,6 +25,7 @@ from commonmap.matching.maps import (
 from commonmap.matching.refine import Refined, lift
 from commonmap.matching.search import Peaks, centre_columns, plan_search, search
 from commonmap.matching.search_metric import search_metric
+from commonmap.matching.seen_free import know_by_rays
 from commonmap.matching.slabs import SlabGrid, coarsen, list_columns, scatter
 from commonmap.matching.verify import Maps, both, verify
 from commonmap.metrics.table import METRICS
@@ -77,6 +78,13 @@ def match(
             lambda: build_layers(base, cell, edges, max_height),
             lambda: build_layers(draft, cell, edges, max_height),
         )
+    if config.grid.rays:
+        with _timed(timings, "rays"):
+            progress("trace the rays")
+            base_layers, draft_layers = both(
+                lambda: know_by_rays(base_layers, target, base),
+                lambda: know_by_rays(draft_layers, source, draft),
+            )
 
     # 3. every x, y and yaw; and again with the source mirrored
     with _timed(timings, "search"):
