@@ -4,6 +4,7 @@
     python benchmarks/decision.py fit                               # the weights for decide.py
     python benchmarks/decision.py draw                              # docs/images/decision.png
     python benchmarks/decision.py show [--from 4000]                # right, refused, false accepts
+    python benchmarks/decision.py collect --rays ...                # `match --rays`, own records
 
 A case is a pair of robots in one simulated place (overlap 0.12 to 1, drift 0 to 1 %, tilt to 1
 degree, up to 30 % of the objects changed), or a draft of another place of the same or another kind,
@@ -19,6 +20,7 @@ import json
 import logging
 import lzma
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -38,17 +40,23 @@ from commonmap.matching.decide import (
 )
 from commonmap.matching.match import match
 from commonmap.sim.pairs import simulate_pair
+from commonmap.types import Cloud
 from commonmap.version import __version__
 
 KINDS = ("paper", "city", "forest", "village", "industrial", "field")
 RECORDS = Path(__file__).parent / "records" / "decision.jsonl.xz"
+WITH_RAYS = RECORDS.with_name("decision_rays.jsonl.xz")
 FIT_BELOW = 4000
 RIGHT = (1.0, np.radians(2.0))
 MIRRORED = "mirrored"
 
 
-def simulate(seed: int, cache: Path | None = None) -> dict[str, Any]:
-    """Return both maps, the truth and the conditions of a seed; kept in the cache, if any."""
+def simulate(seed: int, cache: Path | None = None, *, rays: bool = False) -> dict[str, Any]:
+    """Return both maps, the truth and the conditions of a seed; kept in the cache, if any.
+
+    rays: keep the rays of both maps, which the cache does not.
+    """
+    cache = None if rays else cache
     path = cache / f"{seed}.npz" if cache else None
     if path is not None and path.exists():
         with np.load(path) as kept:
@@ -66,6 +74,11 @@ def simulate(seed: int, cache: Path | None = None) -> dict[str, Any]:
     kind = KINDS[seed % len(KINDS)]
     pair = simulate_pair(kind, rng=rng, max_points=500_000, **conditions)
     conditions = {"kind": kind, **conditions, "overlap": pair.overlap}
+    if rays:
+        return {
+            "target": pair.target, "source": pair.source, "T": pair.T_target_source,
+            "conditions": conditions,
+        }  # fmt: skip
     # single precision in the cache and out of it: the answer must not depend on where it came from
     target, source = pair.target.xyz.astype(np.float32), pair.source.xyz.astype(np.float32)
     if path is not None:
@@ -79,7 +92,9 @@ def simulate(seed: int, cache: Path | None = None) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def collect(first: int, n_pairs: int, n_others: int, cache: Path | None, share: str) -> None:
+def collect(
+    first: int, n_pairs: int, n_others: int, cache: Path | None, share: str, *, rays: bool
+) -> None:
     """Append the cases of `n_pairs` seeds to the records: each base with its own draft, with
     `n_others` drafts of other places of its kind, with one of another kind, and with its own in
     a mirror.
@@ -87,10 +102,11 @@ def collect(first: int, n_pairs: int, n_others: int, cache: Path | None, share: 
     share: "k/n", take only every n-th base from the k-th; several runs can share the work.
     """
     logging.getLogger("commonmap").setLevel(logging.ERROR)
-    RECORDS.parent.mkdir(exist_ok=True)
+    records = WITH_RAYS if rays else RECORDS
+    records.parent.mkdir(exist_ok=True)
     done = set()
-    if RECORDS.exists():
-        kept = load(first, first + n_pairs)
+    if records.exists():
+        kept = load(first, first + n_pairs, records)
         done = {(r["seed"], r["draft"], r["label"] == MIRRORED) for r in kept}
     start_at, of = (int(part) for part in share.split("/"))
     for seed in range(first + start_at, first + n_pairs, of):
@@ -101,23 +117,34 @@ def collect(first: int, n_pairs: int, n_others: int, cache: Path | None, share: 
             mirrored = n == len(drafts) - 1
             if (seed, draft, mirrored) in done or (n and draft == seed and not mirrored):
                 continue
-            place = place or simulate(seed, cache)
-            other = place if draft == seed else simulate(draft, cache)
+            place = place or simulate(seed, cache, rays=rays)
+            other = place if draft == seed else simulate(draft, cache, rays=rays)
             if mirrored:
-                other = {**place, "source": place["source"] * [1.0, -1.0, 1.0], "mirrored": True}
-            record = judge(place, other, seed, draft, 1.0 if (seed + n) % 2 else None)
-            with lzma.open(RECORDS, "at", encoding="utf-8") as out:
+                other = {**place, "source": mirror(place["source"]), "mirrored": True}
+            record = judge(place, other, seed, draft, 1.0 if (seed + n) % 2 else None, rays=rays)
+            with lzma.open(records, "at", encoding="utf-8") as out:
                 out.write(json.dumps(record) + "\n")
             print(seed, draft, record["kind"], record["label"], record["max_height"],
                   "accepted" if record["accepted"] else "refused",
                   "right" if record["right"] else "-", f"{record['confidence']:.3f}", flush=True)
 
 
+def mirror(source: Any) -> Any:
+    """Return a map in a mirror."""
+    flip = np.array([1.0, -1.0, 1.0])
+    if isinstance(source, Cloud):
+        assert source.origin is not None
+        origin = (source.origin * flip).astype(np.float32)
+        return replace(source, xyz=source.xyz * flip, origin=origin)
+    return source * flip
+
+
 def judge(
-    place: dict[str, Any], other: dict[str, Any], seed: int, draft: int, max_height: float | None
-) -> dict[str, Any]:
+    place: dict[str, Any], other: dict[str, Any], seed: int, draft: int, max_height: float | None,
+    *, rays: bool = False,
+) -> dict[str, Any]:  # fmt: skip
     """Return the record of one case."""
-    config = Config().with_values(grid={"max_height": max_height})
+    config = Config().with_values(grid={"max_height": max_height, "rays": rays})
     start = time.process_time()
     found = match(place["target"], other["source"], config=config)
     kind = place["conditions"]["kind"]
@@ -136,15 +163,17 @@ def judge(
         best = found.T_target_source
         if best is None:
             best = found.rivals[0].T_target_source
-        metres, radians = difference(best, place["T"], other["source"].mean(axis=0))
+        source = other["source"]
+        xyz = source.xyz if isinstance(source, Cloud) else source
+        metres, radians = difference(best, place["T"], xyz.mean(axis=0))
         record |= {"metres": metres, "radians": radians}
         record["right"] = bool(metres < RIGHT[0] and radians < RIGHT[1])
     return record
 
 
-def load(first: int, last: int) -> list[dict[str, Any]]:
+def load(first: int, last: int, path: Path = RECORDS) -> list[dict[str, Any]]:
     """Return the records of the seeds from `first` up to, not including, `last`."""
-    with lzma.open(RECORDS, "rt", encoding="utf-8") as lines:
+    with lzma.open(path, "rt", encoding="utf-8") as lines:
         records = [json.loads(line) for line in lines]
     return [r for r in records if first <= r["seed"] < last]
 
@@ -264,11 +293,15 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=60)
     parser.add_argument("--others", type=int, default=5)
     parser.add_argument("--cache", type=Path)
+    parser.add_argument("--rays", action="store_true")
     parser.add_argument("--share", default="0/1")
     parser.add_argument("--from", dest="start", type=int, default=0)
     options = parser.parse_args()
     if options.job == "collect":
-        collect(options.first, options.pairs, options.others, options.cache, options.share)
+        collect(
+            options.first, options.pairs, options.others, options.cache, options.share,
+            rays=options.rays,
+        )  # fmt: skip
     elif options.job == "fit":
         fit()
     elif options.job == "draw":
