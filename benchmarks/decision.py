@@ -204,9 +204,9 @@ def fit() -> None:
         print("  lowest p of the right:", np.sort(p[y == 1])[:8].round(3))
 
 
-def judged(first: int) -> dict[str, np.ndarray]:
+def judged(first: int, path: Path = RECORDS) -> dict[str, np.ndarray]:
     """Return what today's model says of the records from `first` on, by name, an array each."""
-    records = load(first, 1 << 40)
+    records = load(first, 1 << 40, path)
     verdicts = [decide(figures_of(r)) for r in records]
     return {
         "p": np.array([v.confidence for v in verdicts]),
@@ -220,9 +220,9 @@ def judged(first: int) -> dict[str, np.ndarray]:
 BINS = ((0, 0.02), (0.02, 0.1), (0.1, 0.5), (0.5, 0.9), (0.9, 0.99), (0.99, 1.01))
 
 
-def show(first: int) -> None:
+def show(first: int, path: Path = RECORDS) -> None:
     """Print what today's model does on the seeds from `first` on."""
-    j = judged(first)
+    j = judged(first, path)
     p, accepted, right, same = j["p"], j["accepted"], j["right"], j["same"]
     print(f"{len(p)} cases, {same.sum()} of the same place, {(~same).sum()} of others")
     both = (accepted & right).sum()
@@ -307,7 +307,7 @@ def main() -> None:
     elif options.job == "draw":
         draw(Path(__file__).parents[1] / "docs" / "images" / "decision.png")
     else:
-        show(options.start)
+        show(options.start, WITH_RAYS if options.rays else RECORDS)
 
 
 if __name__ == "__main__":
