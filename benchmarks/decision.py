@@ -18,13 +18,13 @@ from __future__ import annotations
 import argparse
 import json
 import logging
-import lzma
 import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from record_lines import add_lines, read_lines
 from scipy.optimize import minimize
 from scipy.stats import beta
 
@@ -103,11 +103,8 @@ def collect(
     """
     logging.getLogger("commonmap").setLevel(logging.ERROR)
     records = WITH_RAYS if rays else RECORDS
-    records.parent.mkdir(exist_ok=True)
-    done = set()
-    if records.exists():
-        kept = load(first, first + n_pairs, records)
-        done = {(r["seed"], r["draft"], r["label"] == MIRRORED) for r in kept}
+    kept = load(first, first + n_pairs, records)
+    done = {(r["seed"], r["draft"], r["label"] == MIRRORED) for r in kept}
     start_at, of = (int(part) for part in share.split("/"))
     for seed in range(first + start_at, first + n_pairs, of):
         drafts = [seed, *(seed + len(KINDS) * (n + 1) for n in range(n_others)), seed + 1, seed]
@@ -122,8 +119,7 @@ def collect(
             if mirrored:
                 other = {**place, "source": mirror(place["source"]), "mirrored": True}
             record = judge(place, other, seed, draft, 1.0 if (seed + n) % 2 else None, rays=rays)
-            with lzma.open(records, "at", encoding="utf-8") as out:
-                out.write(json.dumps(record) + "\n")
+            add_lines(records, [record])
             print(seed, draft, record["kind"], record["label"], record["max_height"],
                   "accepted" if record["accepted"] else "refused",
                   "right" if record["right"] else "-", f"{record['confidence']:.3f}", flush=True)
@@ -173,9 +169,7 @@ def judge(
 
 def load(first: int, last: int, path: Path = RECORDS) -> list[dict[str, Any]]:
     """Return the records of the seeds from `first` up to, not including, `last`."""
-    with lzma.open(path, "rt", encoding="utf-8") as lines:
-        records = [json.loads(line) for line in lines]
-    return [r for r in records if first <= r["seed"] < last]
+    return [r for r in read_lines(path) if first <= r["seed"] < last]
 
 
 def figures_of(record: dict[str, Any]) -> Figures:

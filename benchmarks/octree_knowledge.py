@@ -19,13 +19,13 @@ draft's best and over the best pose elsewhere. Every second pair uses heights un
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from record_lines import add_lines, read_lines
 
 from commonmap.config import Config
 from commonmap.frames import difference, invert
@@ -111,14 +111,13 @@ def main() -> None:
     options = parser.parse_args()
     logging.getLogger("commonmap").setLevel(logging.ERROR)
     path = options.out / "octree_knowledge.jsonl"
-    records = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    records = read_lines(path)
     done = {r["seed"] for r in records}
     for seed in range(options.first, options.first + options.pairs):
         if seed in done:
             continue
         records.append(run(seed))
-        with path.open("a") as out:
-            out.write(json.dumps(records[-1]) + "\n")
+        add_lines(path, records[-1:])
         print(
             seed,
             records[-1]["kind"],

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 from other_worlds import KINDS, World, build
+from record_lines import add_lines, read_lines
 from scipy.spatial.transform import Rotation
 
 from commonmap.frames import apply, difference, fit_motion, from_rotation, invert
@@ -208,7 +209,7 @@ def judge(pair: dict[str, Any], draft: dict[str, Any], label: str) -> dict[str, 
 
 def show() -> None:
     """Print what the records hold."""
-    records = [json.loads(line) for line in RECORDS.read_text().splitlines()]
+    records = read_lines(RECORDS)
 
     def within(r: dict[str, Any], metres: float, degrees: float) -> bool:
         return r.get("metres", 99.0) < metres and r.get("degrees", 99.0) < degrees
@@ -235,9 +236,7 @@ def main() -> None:
     parser.add_argument("--show", action="store_true")
     options = parser.parse_args()
     logging.getLogger("commonmap").setLevel(logging.ERROR)
-    done = set()
-    if RECORDS.exists():
-        done = {json.loads(line)["seed"] for line in RECORDS.read_text().splitlines()}
+    done = {record["seed"] for record in read_lines(RECORDS)}
     for seed in () if options.show else range(options.first, options.first + options.pairs):
         if seed in done:
             continue
@@ -246,11 +245,10 @@ def main() -> None:
         before = seed - len(KINDS)
         if before >= options.first:
             lines.append(judge(pair, make_pair(before, options.cache), "another place"))
-        with RECORDS.open("a") as out:
-            for line in lines:
-                out.write(json.dumps({"seed": seed, **line}) + "\n")
-                print(seed, line["kind"], line["label"], line["accepted"],
-                      line.get("metres", "-"), line.get("degrees", "-"), flush=True)
+        add_lines(RECORDS, ({"seed": seed, **line} for line in lines))
+        for line in lines:
+            print(seed, line["kind"], line["label"], line["accepted"],
+                  line.get("metres", "-"), line.get("degrees", "-"), flush=True)
     show()
 
 

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import lzma
 import os
 import platform
 import statistics
@@ -31,6 +30,7 @@ from typing import Any
 import numpy as np
 from peers_methods import CPU_LIMIT, PEERS
 from peers_pairs import KINDS, Case, checksum, make_cases
+from record_lines import add_lines, read_lines
 
 from commonmap.frames import difference
 from commonmap.io.atomic import writing
@@ -106,10 +106,7 @@ def commit() -> str:
 
 def read_records() -> list[Record]:
     """Return all records, oldest first."""
-    if not RECORDS.exists():
-        return []
-    with lzma.open(RECORDS, "rt", encoding="utf-8") as lines:
-        return [json.loads(line) for line in lines]
+    return read_lines(RECORDS)
 
 
 def key_of(case: str, name: str, revision: str) -> tuple[str, str, str]:
@@ -122,14 +119,12 @@ def run_all(folder: Path, peers: list[str], other: str | None) -> None:
     interpreters = find_interpreters(peers, other)
     cases = make_cases(folder)
     done = {key_of(r["case"], r["peer"], r["commit"]) for r in read_records()}
-    RECORDS.parent.mkdir(exist_ok=True)
     for case in cases:
         for name, python in interpreters.items():
             if key_of(case.name, name, commit()) in done:
                 continue
             record = run(case, name, python)
-            with lzma.open(RECORDS, "at", encoding="utf-8") as out:
-                out.write(json.dumps(record) + "\n")
+            add_lines(RECORDS, [record])
             print(
                 f"{case.name:12s} {case.family:10s} {name:14s} "
                 f"{'accepted' if record['accepted'] else 'refused':8s} "

@@ -12,12 +12,12 @@ average) are kept, one line a pair. Seeds that are in the records are not run ag
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from record_lines import add_lines, read_lines
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -70,24 +70,22 @@ def main() -> None:
     parser.add_argument("--share", default="0/1")
     options = parser.parse_args()
     logging.getLogger("commonmap").setLevel(logging.ERROR)
-    done = []
-    if RECORDS.exists():
-        done = [json.loads(line) for line in RECORDS.read_text().splitlines()]
+    records = read_lines(RECORDS)
+    done = {r["seed"] for r in records}
     start, step = (int(part) for part in options.share.split("/"))
     for seed in range(options.first + start, options.first + options.pairs, step):
-        if any(r["seed"] == seed for r in done):
+        if seed in done:
             continue
-        done.append(run(seed))
-        with RECORDS.open("a") as out:
-            out.write(json.dumps(done[-1]) + "\n")
+        records.append(run(seed))
+        add_lines(RECORDS, records[-1:])
         print(
             seed,
-            done[-1]["kind"],
-            f"{done[-1].get('metres', np.nan):.4f} m",
-            f"{done[-1].get('nees', np.nan):.1f}",
+            records[-1]["kind"],
+            f"{records[-1].get('metres', np.nan):.4f} m",
+            f"{records[-1].get('nees', np.nan):.1f}",
             flush=True,
         )
-    show([r for r in done if r["accepted"]])
+    show([r for r in records if r["accepted"]])
 
 
 def show(done: list[dict[str, Any]]) -> None:

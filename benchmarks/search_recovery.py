@@ -14,7 +14,6 @@ records are not run again.
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 import time
 from collections.abc import Iterator
@@ -22,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from record_lines import add_lines, read_lines
 
 from commonmap.config import Config
 from commonmap.frames import apply, from_xyz_yaw
@@ -96,16 +96,14 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "records")
     options = parser.parse_args()
     logging.getLogger("commonmap").setLevel(logging.ERROR)
-    options.out.mkdir(parents=True, exist_ok=True)
     path = options.out / "search_recovery.jsonl"
-    records = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    records = read_lines(path)
     done = {record["place"] for record in records}
     for place in range(options.first, options.first + options.places):
         if place in done:
             continue
         found = list(run(place, options.crops))
-        with path.open("a") as out:
-            out.writelines(json.dumps(record) + "\n" for record in found)
+        add_lines(path, found)
         for n, record in enumerate(found):
             print(place, n, record["kind"], f"{record['width']:.0f} m", f"{record['score']:.0f}",
                   f"{record['exhaustive']:.0f}", "" if record["found"] else "LOWER", flush=True)
