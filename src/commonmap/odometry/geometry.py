@@ -68,12 +68,7 @@ def complete_scan(
         time = times_of(scan.xyz, ring, scan.stamp, period)
         note = "the log has no time per point: times were derived from the azimuth of the points"
         _tell(notes, note, "the log has no time")
-    return Scan(scan.xyz, time, ring, scan.intensity, scan.stamp, scan.timed and not lacks[1])
-
-
-def at_its_stamp(scan: Scan) -> Scan:
-    """Return a turn whose points were moved to one moment with that as the time of all."""
-    return replace(scan, time=np.full(len(scan.xyz), scan.stamp), timed=False)
+    return replace(scan, time=time, ring=ring, timed=scan.timed and not lacks[1])
 
 
 def _tell(notes: list[str], note: str, kind: str) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from commonmap.odometry.geometry import at_its_stamp, complete_scans
+from commonmap.odometry.geometry import complete_scans
 from commonmap.types import Float64s, Scan, Trajectory
 
 
@@ -96,9 +96,10 @@ class Odometry:
     deskewed: bool = False
 
     def as_taken(self, scans: Iterable[Scan]) -> Iterator[Scan]:
-        """Yield the turns with the rings and times with which their poses were found."""
-        for scan in complete_scans(scans, []):
-            yield at_its_stamp(scan) if self.deskewed else scan
+        """Yield the turns with the times at which their points are to be placed."""
+        if self.deskewed:
+            return (replace(scan, time=np.full(len(scan.xyz), scan.stamp)) for scan in scans)
+        return complete_scans(scans, [])
 
     @property
     def n_lost(self) -> int:

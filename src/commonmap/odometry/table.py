@@ -237,9 +237,9 @@ def take_poses(scans: Iterable[Scan], poses: Trajectory, progress: Progress) -> 
     known = Trajectory(np.asarray(poses.time, np.float64), T)
     stamps, n_outside = [], 0
     first, last = np.inf, -np.inf
-    at_once = True  # points that all have the time of their turn were moved there
+    spread = False  # points that all have the time of their turn were moved there
     for scan in scans:
-        at_once = at_once and float(np.ptp(scan.time)) == 0.0 if len(scan.time) else at_once
+        spread = spread or bool((scan.time != scan.time[:1]).any())
         stamps.append(scan.stamp)
         n_outside += not covers(known, scan)
         first = min(first, float(scan.time.min(initial=scan.stamp)))
@@ -251,7 +251,7 @@ def take_poses(scans: Iterable[Scan], poses: Trajectory, progress: Progress) -> 
         )
     outside = f"{n_outside} of {len(stamps)} turns lie outside the time of the known poses"
     notes = (outside,) if n_outside else ()
-    return Odometry("poses", _cut(known, first, last), (), notes, deskewed=at_once)
+    return Odometry("poses", _cut(known, first, last), (), notes, deskewed=not spread)
 
 
 def _cut(known: Trajectory, first: float, last: float) -> Trajectory:
