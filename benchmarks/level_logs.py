@@ -29,7 +29,8 @@ from odometry import ROBOTS, make_log
 from commonmap.frames import invert
 from commonmap.mapping.level import find_level
 from commonmap.mapping.level_log import find_turn_axis
-from commonmap.pipeline_logs import map_log, move_cloud, move_trajectory
+from commonmap.mapping.points import move_cloud
+from commonmap.pipeline_logs import map_log, move_trajectory
 from commonmap.sim.recording import fit_truth
 from commonmap.types import Float64s
 

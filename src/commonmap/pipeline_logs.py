@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from commonmap.errors import InputError
-from commonmap.frames import apply
 from commonmap.io.logs.imu import Acceleration
 from commonmap.mapping.level import Levelling, no_levelling
 from commonmap.mapping.level_log import level_log
+from commonmap.mapping.points import move_cloud
 from commonmap.odometry import (
     Accumulator,
     LoamOptions,
@@ -122,14 +122,6 @@ def map_log(
         move_cloud(T, cloud), answer.trajectory, answer, levelling, gathered.voxel,
         counted.n, counted.n_left_out, notes, counted.sound,
     )  # fmt: skip
-
-
-def move_cloud(T_a_b: Float64s, cloud: Cloud) -> Cloud:
-    """Return a cloud of frame b, with its ray origins, in frame a."""
-    origin = cloud.origin
-    if origin is not None:
-        origin = apply(T_a_b, origin).astype(np.float32)
-    return replace(cloud, xyz=apply(T_a_b, cloud.xyz), origin=origin)
 
 
 def move_trajectory(T_a_b: Float64s, trajectory: Trajectory) -> Trajectory:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from commonmap.errors import EmptyMapError
-from commonmap.frames import check_points
+from commonmap.frames import apply, check_points
 from commonmap.types import TREE_DEPTH, Bools, Cloud, Float64s, Leaves
 
 GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
@@ -75,10 +77,11 @@ def sample(xyz: Float64s, n_most: int) -> Float64s:
     Where in its run a point is taken from follows the golden ratio: an even step would meet the
     same rings of a spinning lidar over and over.
     """
-    return xyz if len(xyz) <= n_most else xyz[_sampled(len(xyz), n_most)]
+    return xyz if len(xyz) <= n_most else xyz[sampled(len(xyz), n_most)]
 
 
-def _sampled(n: int, n_most: int) -> NDArray[np.int64]:
+def sampled(n: int, n_most: int) -> NDArray[np.int64]:
+    """Return which of n points `sample` takes where there are more than `n_most`, rising."""
     run = np.arange(n_most, dtype=np.float64)
     place: Float64s = (run + (run * GOLDEN) % 1.0) * (n / n_most)
     return place.astype(np.int64)
@@ -90,6 +93,14 @@ def move(T_a_b: Float64s, xyz: Float64s) -> Float64s:
     One pass on one thread: what runs beside it keeps its core.
     """
     return np.asarray(_move(T_a_b, np.ascontiguousarray(xyz, dtype=np.float64)))
+
+
+def move_cloud(T_a_b: Float64s, cloud: Cloud) -> Cloud:
+    """Return a cloud of frame b, with its ray origins, in frame a."""
+    origin = cloud.origin
+    if origin is not None:
+        origin = apply(T_a_b, origin).astype(np.float32)
+    return replace(cloud, xyz=apply(T_a_b, cloud.xyz), origin=origin)
 
 
 def thin(xyz: Float64s, voxel: float, n_most: int | None = None) -> Float64s:

@@ -11,10 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from commonmap.frames import apply
 from commonmap.mapping.octree import Octree
 from commonmap.mapping.octree_build import insert_cloud
 from commonmap.mapping.octree_columns import octree_columns
+from commonmap.mapping.points import move_cloud, sampled
 from commonmap.matching.maps import Layers, Prepared
 from commonmap.matching.slabs import pack_slabs
 from commonmap.types import Bools, Cloud, Float64s, Leaves
@@ -50,7 +50,7 @@ def see_free(layers: Layers, item: Cloud | Leaves | Float64s, prepared: Prepared
     shift = np.zeros(3)
     if isinstance(item, Cloud) and item.origin is not None:
         tree = Octree(grid.cell)
-        insert_cloud(_moved(item, T), tree, discretize=True)
+        insert_cloud(move_cloud(T, _some_rays(item)), tree, discretize=True)
         leaves = tree.leaves()
     elif isinstance(item, Leaves) and not item.occupied.all() and np.allclose(T[:3, :3], np.eye(3)):
         leaves, shift = item, T[:3, 3]
@@ -68,13 +68,10 @@ def see_free(layers: Layers, item: Cloud | Leaves | Float64s, prepared: Prepared
     return np.asarray(columns["free_share"] >= FREE_SHARE)
 
 
-def _moved(cloud: Cloud, T: Float64s) -> Cloud:
-    """Return at most `MOST_RAYS` rays of a cloud, evenly taken, in the prepared frame."""
+def _some_rays(cloud: Cloud) -> Cloud:
+    """Return the cloud with at most `MOST_RAYS` of its rays, and nothing else of it."""
     assert cloud.origin is not None
     n = len(cloud.xyz)
-    few = np.linspace(0, n - 1, min(n, MOST_RAYS)).astype(np.int64)
-    return Cloud(
-        xyz=apply(T, cloud.xyz[few].astype(np.float64)),
-        origin=apply(T, cloud.origin[few].astype(np.float64)).astype(np.float32),
-        time=None if cloud.time is None else cloud.time[few],
-    )
+    few = slice(None) if n <= MOST_RAYS else sampled(n, MOST_RAYS)
+    time = None if cloud.time is None else cloud.time[few]
+    return Cloud(xyz=cloud.xyz[few], origin=cloud.origin[few], time=time)
