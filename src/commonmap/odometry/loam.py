@@ -223,15 +223,7 @@ class Loam:
             rows = match_scan(here, ring, len(taken.sharp), T, *before, reach)
             if len(rows) < 20:
                 break
-            T_new, _, _ = settle(
-                T,
-                rows,
-                None,
-                prior,
-                lever=self.lever,
-                tolerance=o.tolerance,
-                correct=bool(prior.information.any()),
-            )
+            T_new, _, _ = self._settle(T, rows, None, prior)
             step = self._moved(T, T_new)
             T = T_new
             new_rate, _ = sweep_motion(motion_between(T, STAY), dt)
@@ -305,16 +297,23 @@ class Loam:
                 rows = rows.refresh(here)
             if len(rows) < LEAST_MATCHED:
                 break
-            T_new, open_, w = settle(
-                T, rows, open_, prior, lever=self.lever, tolerance=o.tolerance,
-                correct=bool(prior.information.any()),
-            )  # fmt: skip
+            T_new, open_, w = self._settle(T, rows, open_, prior)
             step = self._moved(T, T_new)
             T = T_new
             if step < 0.01 * self.voxel:
                 break
         directions = np.zeros((0, 6)) if open_ is None else open_.directions
         return Registered(T, rows, directions, int((w > 0).sum()))
+
+    def _settle(
+        self, T: Float64s, rows: Rows, open_: Openness | None, prior: Prior
+    ) -> tuple[Float64s, Openness, Float64s]:
+        """Return what `settle` does; the pretended hold of noisy normals is taken off where a prior
+        holds what is left open."""
+        return settle(
+            T, rows, open_, prior, lever=self.lever, tolerance=self.options.tolerance,
+            correct=bool(prior.information.any()),
+        )  # fmt: skip
 
     def _moved(self, T: Float64s, T_new: Float64s) -> float:
         """Return how far the scene moves between two poses, metres: shift and turn together."""
