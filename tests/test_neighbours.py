@@ -8,8 +8,13 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from commonmap.matching.neighbours import find_normals, index_points
+from commonmap.matching.neighbours import Normals, PlanIndex, index_points
 from commonmap.types import Float64s
+
+
+def find_normals(index: PlanIndex, k: int) -> Float64s:
+    """Return the normals of all points."""
+    return Normals(index, k)[np.arange(len(index.points))]
 
 
 def surfaces(seed: int) -> Float64s:
@@ -66,3 +71,14 @@ def test_points_that_have_no_plane_have_a_normal_all_the_same() -> None:
     assert np.isfinite(two).all()
     with pytest.raises(ValueError, match="33 came"):
         find_normals(index_points(line, 1.0), 33)
+
+
+def test_normals_on_demand_are_those_of_all() -> None:
+    index = index_points(surfaces(4), 0.2)
+    every = find_normals(index, 12)
+    normals = Normals(index, 12)
+    rng = np.random.default_rng(4)
+    for _ in range(4):  # some again
+        which = rng.integers(0, len(every), 900)
+        assert np.array_equal(normals[which], every[which])
+    assert normals[np.zeros(0, np.int64)].shape == (0, 3)

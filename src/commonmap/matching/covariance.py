@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from commonmap.frames import from_rotation
 from commonmap.mapping.points import move, sample
+from commonmap.matching.neighbours import Normals
 from commonmap.types import Float64s
 
 STEP = 2.0
@@ -50,10 +51,10 @@ other's on the other. Such a shift is common to all patches, so none of them tel
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A target to register on. points, normals: (N, 3). tree: of the points."""
+    """A target to register on. points, normals: (N, 3) or on demand. tree: of the points."""
 
     points: Float64s
-    normals: Float64s
+    normals: Float64s | Normals
     tree: cKDTree
 
 

@@ -58,25 +58,40 @@ def index_points(xyz: Float64s, spacing: float) -> PlanIndex:
         size *= 1.5
     n_x, n_y = (int(n) + 1 for n in np.floor(extent / size))
     column = _columns(np.ascontiguousarray(xyz), low, size, n_x, n_y)
-    order = np.argsort(column, kind="stable")
     starts = np.zeros(n_x * n_y + 1, np.int64)
     np.cumsum(np.bincount(column, minlength=n_x * n_y), out=starts[1:])
+    order = _order_by(column, starts)
     return PlanIndex(xyz[order], order, starts, low[:2], size, (n_x, n_y))
 
 
-def find_normals(index: PlanIndex, n_neighbours: int) -> Float64s:
-    """Return the unit normals (N, 3) of the points, in the order that they came in.
+class Normals:
+    """The unit normals of the points of an index, worked out as they are asked for.
 
     Of each point's `n_neighbours` nearest, itself among them: across their thinnest direction.
+    `normals[which]` are the (M, 3) of (M,) points, numbered as they came in. One thread.
     """
-    if not 3 <= n_neighbours <= MOST_NEIGHBOURS:
-        raise ValueError(f"3 to {MOST_NEIGHBOURS} neighbours make a normal; {n_neighbours} came")
-    return np.asarray(
-        _normals(
-            index.points, index.number, index.starts, index.low, index.size, *index.shape,
-            n_neighbours,
-        )
-    )  # fmt: skip
+
+    def __init__(self, index: PlanIndex, n_neighbours: int) -> None:
+        if not 3 <= n_neighbours <= MOST_NEIGHBOURS:
+            raise ValueError(
+                f"3 to {MOST_NEIGHBOURS} neighbours make a normal; {n_neighbours} came"
+            )
+        self.index, self.n_neighbours = index, n_neighbours
+        self._normal = np.empty_like(index.points)
+        self._found = np.zeros(len(index.points), dtype=bool)
+
+    def __getitem__(self, which: NDArray[np.int64]) -> Float64s:
+        wanted = np.zeros(len(self._found), dtype=bool)
+        wanted[which] = True
+        wanted &= ~self._found
+        if wanted.any():
+            index = self.index
+            _find_normals(
+                index.points, index.number, index.starts, index.low, index.size, *index.shape,
+                self.n_neighbours, wanted, self._normal,
+            )  # fmt: skip
+            self._found |= wanted
+        return np.asarray(self._normal[which])
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
@@ -87,6 +102,16 @@ def _columns(xyz, low, size, n_x, n_y):  # type: ignore[no-untyped-def]
         j = min(int((xyz[n, 1] - low[1]) / size), n_y - 1)
         column[n] = i * n_y + j
     return column
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _order_by(column, starts):  # type: ignore[no-untyped-def]
+    """Return the points by column, those of one in the order that they came in."""
+    order, place = np.empty(column.shape[0], np.int64), starts[:-1].copy()
+    for n in range(column.shape[0]):
+        order[place[column[n]]] = n
+        place[column[n]] += 1
+    return order
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
@@ -130,11 +155,15 @@ def _query(points, number, starts, low, size, n_x, n_y, xyz, reach):  # type: ig
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
-def _normals(points, number, starts, low, size, n_x, n_y, n_neighbours):  # type: ignore[no-untyped-def]
-    out = np.empty_like(points)
+def _find_normals(  # type: ignore[no-untyped-def]
+    points, number, starts, low, size, n_x, n_y, n_neighbours, wanted, out
+):
+    """Set the normals (N, 3) of the points that are wanted, as they are numbered."""
     square = np.empty(MOST_NEIGHBOURS)
     near = np.empty(MOST_NEIGHBOURS, np.int64)
     for n in range(points.shape[0]):
+        if not wanted[number[n]]:
+            continue
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
         i0 = min(int((x - low[0]) / size), n_x - 1)
         j0 = min(int((y - low[1]) / size), n_y - 1)
@@ -170,7 +199,6 @@ def _normals(points, number, starts, low, size, n_x, n_y, n_neighbours):  # type
                             place -= 1
                         square[place], near[place] = s, m
         _thinnest(points, near, found, out[number[n]])
-    return out
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]

@@ -17,7 +17,7 @@ from commonmap.frames import apply, from_rotation
 from commonmap.mapping.ground import Ground
 from commonmap.mapping.points import bounds, inside_box, move, thin
 from commonmap.matching.covariance import Pairs, Surface, measure_covariance, pair_points
-from commonmap.matching.neighbours import find_normals, index_points
+from commonmap.matching.neighbours import Normals, index_points
 from commonmap.types import Float64s
 
 MOST_WALKING = 5_000
@@ -143,9 +143,9 @@ def refine(
 
 
 def _surface(xyz: Float64s, voxel: float) -> Surface:
-    """Return the points, one a voxel, with their unit normals, from 20 neighbours."""
+    """Return the points, one a voxel, with their unit normals, from 20 neighbours, on demand."""
     index = index_points(xyz, voxel)
-    return Surface(xyz, find_normals(index, 20), index)
+    return Surface(xyz, Normals(index, 20), index)
 
 
 def _unrefined(start: Float64s, source_xyz: Float64s) -> Refined:
