@@ -128,22 +128,56 @@ def first_of_voxels(xyz: Float64s, voxel: float) -> NDArray[np.int64]:
 
 def _group(xyz: Float64s, voxel: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the points' order by voxel, and where each voxel starts in it."""
-    key = _voxel_keys(np.ascontiguousarray(xyz), 1.0 / voxel)
-    order = np.argsort(key, kind="stable")
-    edges = np.nonzero(np.diff(key[order]))[0] + 1
+    xyz = np.ascontiguousarray(xyz)
+    low, high = (np.floor(end / voxel) for end in bounds(xyz))
+    shape = high - low + 1.0
+    if np.prod(shape) >= 2.0**62:
+        shape = np.full(3, 2.0**20)  # folded onto as many voxels as can be numbered
+    key = _voxel_keys(xyz, 1.0 / voxel, low, shape.astype(np.int64))
+    order, key = _sort(key)
+    edges = np.nonzero(np.diff(key))[0] + 1
     return order, np.concatenate([[0], edges, [len(key)]]).astype(np.int64)
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
-def _voxel_keys(xyz, scale):  # type: ignore[no-untyped-def]
-    """Return one int64 per point, 21 bits an axis: equal for the points of one voxel."""
+def _voxel_keys(xyz, scale, low, shape):  # type: ignore[no-untyped-def]
+    """Return one number per point, the same in a voxel, rising in x, then y, then z."""
     key = np.empty(xyz.shape[0], np.int64)
     for n in range(xyz.shape[0]):
-        i = int(np.floor(xyz[n, 0] * scale)) & 0x1FFFFF
-        j = int(np.floor(xyz[n, 1] * scale)) & 0x1FFFFF
-        k = int(np.floor(xyz[n, 2] * scale)) & 0x1FFFFF
-        key[n] = (i << 42) | (j << 21) | k
+        number = np.int64(0)
+        for a in range(3):
+            cell = np.int64(np.floor(xyz[n, a] * scale) - low[a])
+            # rounding may leave a point of the rim one cell outside
+            number = number * shape[a] + min(max(cell, 0), shape[a] - 1)
+        key[n] = number
     return key
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _sort(key):  # type: ignore[no-untyped-def]
+    """Return the order of keys of 0 and up, equal ones as they came, and the sorted keys.
+
+    By digits of 11 bits, the last one first: as many passes as the largest key has.
+    """
+    n, digit = key.shape[0], 11
+    order, sorted_key = np.arange(n), key.copy()
+    next_order, next_key = np.empty_like(order), np.empty_like(key)
+    place = np.empty((1 << digit) + 1, np.int64)
+    most, shift = key.max() if n > 0 else 0, 0
+    while most >> shift > 0:
+        place[:] = 0
+        for i in range(n):
+            place[((sorted_key[i] >> shift) & ((1 << digit) - 1)) + 1] += 1
+        for d in range(1 << digit):
+            place[d + 1] += place[d]
+        for i in range(n):
+            d = (sorted_key[i] >> shift) & ((1 << digit) - 1)
+            next_key[place[d]], next_order[place[d]] = sorted_key[i], order[i]
+            place[d] += 1
+        sorted_key, next_key = next_key, sorted_key
+        order, next_order = next_order, order
+        shift += digit
+    return order, sorted_key
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
