@@ -1,4 +1,4 @@
-"""A stand-in for CuPy without a GPU: NumPy behind arrays that are as strict as CuPy's.
+"""CuPy where there is a GPU; else a stand-in: NumPy behind arrays that are as strict as CuPy's.
 
 What CuPy refuses is refused here: an array of the host in a sum, as an argument, or written
 into an array of the device; an array of the device that becomes one of the host other than by
@@ -7,6 +7,7 @@ into an array of the device; an array of the device that becomes one of the host
 
 from __future__ import annotations
 
+import importlib
 import sys
 import types
 from collections.abc import Callable
@@ -126,24 +127,37 @@ def transform_of(name: str) -> Any:
     """Return the stand-in of `cupyx.scipy.fft.<name>`: no `workers`, and only of the device."""
     value = getattr(scipy.fft, name)
 
-    def transform(
-        x: DeviceArray, n: int | None = None, axis: int = -1, norm: Any = None,
-        overwrite_x: bool = False,
-    ) -> DeviceArray:  # fmt: skip
+    def transform(x: DeviceArray, **options: Any) -> DeviceArray:
         if not isinstance(x, DeviceArray):
             raise TypeError("an array of the host came to a transform of the device")
-        return DeviceArray(value(x._host, n=n, axis=axis, norm=norm, overwrite_x=overwrite_x))
+        if not options.keys() <= {"n", "s", "axis", "axes", "norm", "overwrite_x"}:
+            raise TypeError(f"CuPy's {name} does not take all of {sorted(options)}")
+        return DeviceArray(value(x._host, **options))
 
     return transform
 
 
+def has_gpu() -> bool:
+    """Return whether CuPy finds a GPU that works."""
+    try:
+        cupy = importlib.import_module("cupy")
+        return bool(float(cupy.ones(3).sum()) == 3.0)
+    except Exception:  # whatever CuPy says about a missing driver
+        return False
+
+
 def install(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let `import cupy` and `import cupyx.scipy.fft` find the stand-ins, for one test."""
+    """Let `import cupy` and `import cupyx.scipy.fft` find the stand-ins, for one test.
+
+    Where there is a GPU they find CuPy, and the test runs on it.
+    """
+    if has_gpu():
+        return
     cupy, cupyx = types.ModuleType("cupy"), types.ModuleType("cupyx")
     cupyx_scipy, cupyx_fft = types.ModuleType("cupyx.scipy"), types.ModuleType("cupyx.scipy.fft")
     for name in IN_CUPY:
         setattr(cupy, name, function_of(name))
-    for name in ("fft", "ifft", "rfft", "irfft"):
+    for name in ("fft", "ifft", "rfft", "irfft", "rfft2", "irfft2"):
         setattr(cupyx_fft, name, transform_of(name))
     for module in (cupy, cupyx, cupyx_scipy, cupyx_fft):
         monkeypatch.setitem(sys.modules, module.__name__, module)

@@ -158,7 +158,7 @@ def test_planes_by_hand() -> None:
     bits = np.zeros((2, 70), np.uint32)
     bits[0, 0], bits[0, 63], bits[1, 64], bits[1, 69] = 1, 3, 2, 1
     planes = pack_planes(bits, 2, 1)
-    assert planes.shape == (2, 4, 2)
+    assert planes.shape == (2, 4, 8) and not planes[..., 2:].any()
     assert planes[0, :, 0].tolist() == [0, 1 + (1 << 63), 0, 0]
     assert planes[0, :, 1].tolist() == [0, 1 << 63, 0, 0]
     assert planes[1, :, 0].tolist() == [0, 0, 1 << 5, 0]

@@ -12,14 +12,20 @@ from hypothesis import strategies as st
 from commonmap.matching.arrays import NUMPY
 from commonmap.matching.evidence import (
     count_tables,
-    evidence_surface,
     signed_evidence,
     sum_table,
-    transform_target,
     uncertainty,
     weigh,
     xlogx_table,
 )
+from commonmap.matching.evidence_fft import (
+    evidence_peaks,
+    evidence_surface,
+    evidence_surfaces,
+    plan_lanes,
+    transform_target,
+)
+from commonmap.matching.peaks import local_maxima
 from commonmap.matching.search import evidence_at
 from commonmap.matching.slabs import (
     Columns,
@@ -141,11 +147,9 @@ def test_the_surface_equals_brute_force_at_every_shift(
     rng = np.random.default_rng(sum(target_shape) * 31 + sum(source_shape))
     o_t, k_t = random_slabs(rng, 3, target_shape, shared=shared[0])
     o_s, k_s = random_slabs(rng, 3, source_shape, shared=shared[1])
-    spectra = transform_target(packed(o_t, k_t), source_shape, workers=1)
+    spectra = transform_target(packed(o_t, k_t), source_shape)
     source = packed(o_s, k_s)
-    score, overlap = evidence_surface(
-        spectra, source.occupied, source.known, min_overlap=1.0, workers=1
-    )
+    score, overlap = evidence_surface(spectra, source.occupied, source.known, min_overlap=1.0)
     sx, sy = source_shape
     assert score.shape == (target_shape[0] + sx - 1, target_shape[1] + sy - 1)
     for u in range(score.shape[0]):
@@ -168,8 +172,8 @@ def test_the_surface_peaks_where_the_source_was_cut_out() -> None:
     k_t[:] = True
     source = packed(o_t[:, 5:12, 2:7], k_t[:, 5:12, 2:7])
     score, _ = evidence_surface(
-        transform_target(packed(o_t, k_t), (7, 5), workers=1),
-        source.occupied, source.known, min_overlap=20.0, workers=1,
+        transform_target(packed(o_t, k_t), (7, 5)),
+        source.occupied, source.known, min_overlap=20.0,
     )  # fmt: skip
     u, v = np.unravel_index(int(np.argmax(score)), score.shape)
     assert [int(u) - 6, int(v) - 4] == [5, 2]
@@ -180,28 +184,121 @@ def test_shifts_with_too_few_pairs_cannot_win() -> None:
     o_t, k_t = random_slabs(rng, 2, (8, 8), shared=True)
     o_s, k_s = random_slabs(rng, 2, (5, 5), shared=True)
     source = packed(o_s, k_s)
-    spectra = transform_target(packed(o_t, k_t), (5, 5), workers=1)
-    score, overlap = evidence_surface(
-        spectra, source.occupied, source.known, min_overlap=6.5, workers=1
-    )
+    spectra = transform_target(packed(o_t, k_t), (5, 5))
+    score, overlap = evidence_surface(spectra, source.occupied, source.known, min_overlap=6.5)
     assert np.array_equal(np.isfinite(score), overlap >= 6.5)
     assert 0 < np.isfinite(score).sum() < score.size
 
 
-def test_workers_do_not_change_a_bit() -> None:
-    rng = np.random.default_rng(3)
-    o_t, k_t = random_slabs(rng, 5, (37, 41), shared=False)
-    o_s, k_s = random_slabs(rng, 5, (19, 23), shared=False)
-    source = packed(o_s, k_s)
-    found = [
-        evidence_surface(
-            transform_target(packed(o_t, k_t), (19, 23), workers=n),
-            source.occupied, source.known, min_overlap=5.0, workers=n,
-        )
-        for n in (1, 2, 3)
-    ]  # fmt: skip
-    assert found[0][0].tobytes() == found[1][0].tobytes() == found[2][0].tobytes()
-    assert found[0][1].tobytes() == found[1][1].tobytes() == found[2][1].tobytes()
+def random_case(
+    rng: np.random.Generator,
+) -> tuple[SlabGrid, list[SlabGrid], dict[str, tuple[int, int]]]:
+    """Return a target, one to eight sources of one shape, and ranges of translations or none."""
+    n_slabs = int(rng.integers(1, 10))
+    shape = int(rng.integers(5, 40)), int(rng.integers(5, 40))
+    source_shape = int(rng.integers(3, 20)), int(rng.integers(3, 20))
+    empty = int(rng.integers(0, 2 * n_slabs))
+    shared = rng.random(2) < 0.6
+
+    def slabs(size: tuple[int, int], *, alike: bool, without: int) -> SlabGrid:
+        occupied, known = random_slabs(rng, n_slabs, size, shared=alike)
+        if without < n_slabs:
+            occupied[without] = False
+        return packed(occupied, known)
+
+    target = slabs(shape, alike=bool(shared[0]), without=empty)
+    sources = [
+        slabs(source_shape, alike=bool(shared[1]), without=2 * n_slabs - 1 - empty)
+        for _ in range(int(rng.integers(1, 9)))
+    ]
+    ranges = {}
+    for name, t, s in zip(("rows", "columns"), shape, source_shape, strict=True):
+        low, high = sorted(rng.integers(0, t + s, 2).tolist())
+        if rng.random() < 0.5 and high > low:
+            ranges[name] = (low, high)
+    return target, sources, ranges
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_yaws_side_by_side_score_as_each_by_itself(seed: int) -> None:
+    rng = np.random.default_rng([seed, 77])
+    target, sources, ranges = random_case(rng)
+    spectra = transform_target(target, sources[0].shape, **ranges)  # type: ignore[arg-type]
+    double = transform_target(target, sources[0].shape, n_source=10**13)
+    assert (spectra.dtype, double.dtype) == (np.float32, np.float64)
+    occupied, known = (
+        np.stack([getattr(some, name) for some in sources], axis=-1)
+        for name in ("occupied", "known")
+    )
+    least = float(rng.uniform(0, 20))
+    score, overlap = evidence_surfaces(spectra, occupied, known, min_overlap=least)
+    score, overlap = score.copy(), overlap.copy()
+    region = slice(*spectra.rows), slice(*spectra.columns)
+    for n, source in enumerate(sources):
+        alone = evidence_surface(double, source.occupied, source.known, min_overlap=least)
+        assert score[n].tobytes() == alone[0][region].tobytes()
+        assert overlap[n].tobytes() == alone[1][region].tobytes()
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_peaks_are_those_of_the_surface(seed: int) -> None:
+    rng = np.random.default_rng([seed, 78])
+    target, sources, ranges = random_case(rng)
+    spectra = transform_target(target, sources[0].shape, **ranges)  # type: ignore[arg-type]
+    occupied, known = (
+        np.stack([getattr(some, name) for some in sources], axis=-1)
+        for name in ("occupied", "known")
+    )
+    rim, n_peaks, least = rng.integers(0, 2, 4).tolist(), int(rng.integers(1, 7)), rng.uniform(0, 9)
+    score, _ = evidence_surfaces(spectra, occupied, known, min_overlap=least)
+    score = score.copy()
+    found = evidence_peaks(spectra, occupied, known, rim, n_peaks, min_overlap=least)
+    assert len(found) == len(sources)
+    for one, peaks in zip(score, found, strict=True):
+        index, value = local_maxima(one, n_peaks, 0.0, *rim)
+        told = index[:, 0] >= 0
+        assert peaks[:, :2].tolist() == index[told].tolist()
+        assert peaks[:, 2].tolist() == value[told].tolist()
+
+
+def test_the_bound_holds_where_the_evidence_is_all_there_is() -> None:
+    # a target that holds the source itself: n MI = n H, the bound's hardest case
+    rng = np.random.default_rng(5)
+    o_t, k_t = random_slabs(rng, 6, (60, 50), shared=True)
+    o_t[1] = rng.random((60, 50)) < 0.001  # rare
+    o_t[2] = rng.random((60, 50)) < 0.999
+    target = packed(o_t & k_t, k_t)
+    spectra = transform_target(target, (20, 20))
+    occupied, known = target.occupied[20:40, 10:30, None], target.known[20:40, 10:30, None]
+    (peaks,) = evidence_peaks(spectra, occupied, known, (0, 0, 0, 0), 6, min_overlap=9.0)
+    assert peaks[0, :2].tolist() == [39, 29]
+    score, _ = evidence_surface(spectra, occupied[..., 0], known[..., 0], min_overlap=9.0)
+    assert peaks[0, 2] == score[39, 29] == score.max()
+
+
+def test_counts_share_complex_values() -> None:
+    # five slabs and what is known: three lanes; 3 * 5 + 1 counts: eight products
+    five = (True,) * 5
+    job = plan_lanes(five, five, True, True)
+    assert job.parts.tolist() == [[0, 2], [4, 6], [8, 1]]
+    assert len(job.products) == 8
+    assert sorted(np.unique(job.counts).tolist()) == list(range(16))
+    assert job.overlaps.tolist() == [job.counts[0, 0]]
+    assert np.all(job.counts[:, 0] == job.counts[0, 0])  # known pairs: the same for all slabs
+    # what stands in one map alone: its margin counts as uncertainty, and nothing else is asked
+    job = plan_lanes((True, False), (False, True), True, True)
+    assert job.counts.tolist() == [[job.overlaps[0], job.counts[0, 1], -1, -1]]
+    # known slab by slab: four counts each
+    job = plan_lanes(five, five, False, False)
+    assert len(job.parts) == 5 and len(job.products) == 10
+    assert sorted(job.counts.ravel().tolist()) == list(range(20))
+
+
+def test_nine_yaws_are_too_many() -> None:
+    grid = packed(*random_slabs(np.random.default_rng(6), 1, (9, 9), shared=True))
+    nine = np.repeat(grid.occupied[..., None], 9, axis=2)
+    with pytest.raises(ValueError, match="at most 8 yaws at a time; 9 came"):
+        evidence_surfaces(transform_target(grid, (9, 9)), nine, nine, min_overlap=1.0)
 
 
 def test_large_maps_keep_whole_counts() -> None:
@@ -209,10 +306,8 @@ def test_large_maps_keep_whole_counts() -> None:
     rng = np.random.default_rng(4)
     o_t, k_t = random_slabs(rng, 1, (300, 300), shared=True)
     grid = packed(o_t, k_t)
-    spectra = transform_target(grid, (300, 300), workers=1)
-    score, overlap = evidence_surface(
-        spectra, grid.occupied, grid.known, min_overlap=100.0, workers=1
-    )
+    spectra = transform_target(grid, (300, 300))
+    score, overlap = evidence_surface(spectra, grid.occupied, grid.known, min_overlap=100.0)
     assert overlap[299, 299] == k_t.sum()
     assert score[299, 299] == pytest.approx(evidence_direct(o_t, k_t, o_t, k_t), rel=1e-6)
     assert overlap[299, 300] == (k_t[0, :, 1:] & k_t[0, :, :-1]).sum()
@@ -350,8 +445,8 @@ def test_one_pose_by_counting_equals_the_surface() -> None:
         side, side,
     )  # fmt: skip
     score, overlap = evidence_surface(
-        transform_target(grid, (side, side), workers=1), occupied, known,
-        min_overlap=1.0, workers=1,
+        transform_target(grid, (side, side)), occupied, known,
+        min_overlap=1.0,
     )  # fmt: skip
     for u, v in [(11, 11), (14, 12), (16, 18), (20, 9)]:
         pose = np.array([u - (side - 1) - low[0], v - (side - 1) - low[1], yaw])

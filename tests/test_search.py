@@ -9,6 +9,7 @@ import pytest
 
 from commonmap.mapping.ground import find_ground
 from commonmap.mapping.height_map import build_height_map
+from commonmap.matching.peaks import local_maxima
 from commonmap.matching.search import (
     Peaks,
     SearchPlan,
@@ -19,7 +20,6 @@ from commonmap.matching.search import (
 )
 from commonmap.matching.search_metric import scatter_heights, search_metric
 from commonmap.matching.slabs import Columns, SlabGrid, list_columns, pack_slabs
-from commonmap.matching.tiles import local_maxima
 from commonmap.types import Float64s, Floats, GridMap
 from matching_scenes import apart, look, make_place, moved, rigid
 
@@ -230,9 +230,11 @@ def test_local_maxima_by_hand() -> None:
     score = np.zeros((5, 6), np.float32)
     score[0, 0], score[1, 1], score[3, 4], score[4, 0], score[4, 1] = 3.0, 2.0, 5.0, 1.0, 1.0
     # [1, 1] has a higher neighbour; of two equal neighbours the first counts
-    assert local_maxima(score, 4, 0.0).tolist() == [[3, 4], [0, 0], [4, 0], [-1, -1]]
-    assert local_maxima(score, 1, 0.0).tolist() == [[3, 4]]
-    assert local_maxima(np.full((3, 3), -np.inf, np.float32), 2, -np.inf).tolist() == [[-1, -1]] * 2
+    assert local_maxima(score, 4, 0.0)[0].tolist() == [[3, 4], [0, 0], [4, 0], [-1, -1]]
+    assert local_maxima(score, 1, 0.0)[0].tolist() == [[3, 4]]
+    assert (
+        local_maxima(np.full((3, 3), -np.inf, np.float32), 2, -np.inf)[0].tolist() == [[-1, -1]] * 2
+    )
 
 
 def test_separate_keeps_the_best_of_each_neighbourhood() -> None:

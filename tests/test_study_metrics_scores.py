@@ -7,7 +7,7 @@ import pytest
 
 from commonmap.matching.correlate import prepare_target, score_surface
 from commonmap.matching.direct import direct_surface
-from commonmap.matching.evidence import evidence_surface, transform_target
+from commonmap.matching.evidence_fft import evidence_surface, transform_target
 from commonmap.matching.slabs import pack_slabs
 from commonmap.metrics.table import METRICS
 from commonmap.study import metrics_scores
@@ -42,9 +42,7 @@ def _score(top: float, min_cells: int) -> metrics_scores.Scores:
     )
     scores = metrics_scores.score_all(prepared, source, known_s, slabs_s.occupied, slabs_s.known)
     spectra = transform_target(slabs_t, (SIDE, SIDE))
-    evidence, _ = evidence_surface(
-        spectra, slabs_s.occupied, slabs_s.known, min_overlap=1.0, workers=1
-    )
+    evidence, _ = evidence_surface(spectra, slabs_s.occupied, slabs_s.known, min_overlap=1.0)
     own = scores.value[[name for name, _ in COLUMNS].index("evidence")]
     np.testing.assert_array_equal(own, evidence[scores.u, scores.v])
     return scores

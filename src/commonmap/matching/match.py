@@ -13,7 +13,7 @@ from commonmap.config import Config
 from commonmap.errors import EmptyMapError, InputError
 from commonmap.frames import apply, invert
 from commonmap.matching.decide import NOTHING, Figures, Verdict, decide
-from commonmap.matching.evidence import evidence_surface, transform_target
+from commonmap.matching.evidence_fft import evidence_surface, transform_target
 from commonmap.matching.figures import other_poses
 from commonmap.matching.maps import (
     Layers,
@@ -229,8 +229,8 @@ def _draw(
         side, side,
     )  # fmt: skip
     score, _ = evidence_surface(
-        transform_target(grid, (side, side), workers=WORKERS), occupied, known,
-        min_overlap=least_overlap(config) * np.count_nonzero(known), workers=WORKERS,
+        transform_target(grid, (side, side)), occupied, known,
+        min_overlap=least_overlap(config) * np.count_nonzero(known),
     )  # fmt: skip
     shift = -invert(base_map.T_prepared_map)[:2, 3]
     x, y = (

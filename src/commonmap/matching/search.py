@@ -20,7 +20,7 @@ from commonmap.frames import from_xyz_yaw
 from commonmap.matching.arrays import find_rim
 from commonmap.matching.climb import HERE, climb_all, starts_around
 from commonmap.matching.evidence import count_tables, sum_table, weigh, xlogx_table
-from commonmap.matching.slabs import Columns, SlabGrid, coarsen, list_columns
+from commonmap.matching.slabs import Columns, SlabGrid, coarsen, is_shared, list_columns
 from commonmap.matching.tiles import (
     Level,
     Sweep,
@@ -231,9 +231,13 @@ def _search_all(
     sweep = Sweep(columns, cell, low, side, yaws, min_pairs, compute.arrays)
     at_once = workers if compute.scheduler is None else 1
     # where the maps touch in so few rows that no pose there has pairs enough, nothing is scored
-    turned = (turn_columns(sweep, float(yaw))[1] > 0 for yaw in yaws)
+    turned = (turn_columns(sweep, yaw[None])[1][..., 0] > 0 for yaw in yaws)
     rim = find_rim(turned, (side, side), max(1, math.ceil(min_pairs)))
-    plan = plan_tiles(level.shape, side, columns.n_slabs, compute=compute, workers=at_once, rim=rim)
+    shared = level.whole is not None and is_shared(level.whole.known, columns.n_slabs)
+    shared = shared and is_shared(columns.known, columns.n_slabs)
+    plan = plan_tiles(
+        level.shape, side, columns.n_slabs, shared=shared, compute=compute, workers=at_once, rim=rim
+    )
     found = search_tiles(
         level, sweep, plan.tiles, compute=compute, workers=workers, progress=progress
     )

@@ -14,8 +14,9 @@ import numpy as np
 
 from commonmap.matching import correlate
 from commonmap.matching.arrays import find_rim
+from commonmap.matching.peaks import local_maxima
 from commonmap.matching.search import Peaks, count_yaws, separate
-from commonmap.matching.tiles import N_PEAKS, local_maxima
+from commonmap.matching.tiles import N_PEAKS
 from commonmap.metrics.plans import DifferenceSum, JointHistogram, MinSum, Smooth
 from commonmap.metrics.table import find_metric
 from commonmap.types import Float64s, GridMap, Progress, no_progress
@@ -136,7 +137,7 @@ def _search_yaw(
     surface = correlate.score_surface(prepared, turned, known, workers=1)
     gain = -prepared.metric.cost(surface.score)
     score = np.where(np.isfinite(gain), gain, -np.inf).astype(np.float64)
-    index = local_maxima(score, N_PEAKS, -np.inf)
+    index, _ = local_maxima(score, N_PEAKS, -np.inf)
     index = index[index[:, 0] >= 0]
     where = origin + (index - (side - 1)) * cell - low
     values = score[index[:, 0], index[:, 1]]

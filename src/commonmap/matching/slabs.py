@@ -123,6 +123,18 @@ def _join(bits, factor, first_i, first_j, out):  # type: ignore[no-untyped-def]
             row[(j + first_j) // factor] |= bits[i, j]
 
 
+def is_shared(known: Bits, n_slabs: int) -> bool:
+    """Return whether every cell is known in all slabs or in none."""
+    full = np.uint32((1 << n_slabs) - 1)
+    return bool(np.all((known == 0) | (known == full)))
+
+
+def find_standing(occupied: Bits, n_slabs: int) -> tuple[bool, ...]:
+    """Return of each slab whether anything is occupied in it."""
+    any_of = int(np.bitwise_or.reduce(occupied, axis=None))
+    return tuple(bool(any_of >> k & 1) for k in range(n_slabs))
+
+
 @dataclass(frozen=True, eq=False)
 class Columns:
     """The known cells of a map as a list, to be turned and scattered onto another grid.
@@ -155,6 +167,22 @@ def scatter(xy, occupied, known, cosine, sine, cell, low, n_x, n_y):  # type: ig
         if 0 <= i < n_x and 0 <= j < n_y:
             out_occupied[i, j] |= occupied[n]
             out_known[i, j] |= known[n]
+    return out_occupied, out_known
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def scatter_turns(xy, occupied, known, cosines, sines, cell, low, n_x, n_y):  # type: ignore[no-untyped-def]
+    """Return the bits (n_x, n_y, n_turns) of columns turned by some angles, as `scatter`."""
+    n_turns = cosines.shape[0]
+    out_occupied = np.zeros((n_x, n_y, n_turns), np.uint32)
+    out_known = np.zeros((n_x, n_y, n_turns), np.uint32)
+    for n in range(xy.shape[0]):
+        for w in range(n_turns):
+            i = int(np.floor((cosines[w] * xy[n, 0] - sines[w] * xy[n, 1] - low[0]) / cell))
+            j = int(np.floor((sines[w] * xy[n, 0] + cosines[w] * xy[n, 1] - low[1]) / cell))
+            if 0 <= i < n_x and 0 <= j < n_y:
+                out_occupied[i, j, w] |= occupied[n]
+                out_known[i, j, w] |= known[n]
     return out_occupied, out_known
 
 

@@ -9,7 +9,6 @@ of the tiles together are to the bit those of the whole in one piece.
 from __future__ import annotations
 
 import importlib
-import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -17,14 +16,18 @@ from functools import partial
 from itertools import islice, pairwise
 from typing import Any
 
-import numba
 import numpy as np
-from scipy import fft
 
 from commonmap.config import ComputeConfig
 from commonmap.errors import InputError, MissingExtraError
 from commonmap.matching.arrays import find_arrays
-from commonmap.matching.evidence import Spectra, evidence_surface, rounding, transform_target
+from commonmap.matching.evidence_fft import (
+    Spectra,
+    bytes_held,
+    evidence_peaks,
+    transform_target,
+)
+from commonmap.matching.lane_fft import find_length
 from commonmap.matching.slabs import (
     Bits,
     Columns,
@@ -34,7 +37,7 @@ from commonmap.matching.slabs import (
     coarse_shape,
     coarse_window,
     coarsen,
-    scatter,
+    scatter_turns,
 )
 from commonmap.types import Float64s, Progress
 
@@ -135,14 +138,15 @@ def plan_tiles(
     side: int,
     n_slabs: int,
     *,
+    shared: bool,
     compute: ComputeConfig,
     workers: int,
     rim: tuple[int, int] = (0, 0),
 ) -> TilePlan:
     """Return the cheapest tiles that keep the search within `compute.memory_gb`.
 
-    shape: of the target. side: of the source's square. rim: translations at each end along x and
-    y that are left out. Raises InputError where no tile does.
+    shape: of the target. side: of the source's square. shared: both know all slabs alike. rim:
+    translations at each end along x and y that are left out. Raises InputError where no tile does.
     """
     full = (shape[0] + side - 1, shape[1] + side - 1)
     rim = (min(rim[0], (full[0] - 1) // 2), min(rim[1], (full[1] - 1) // 2))
@@ -151,8 +155,8 @@ def plan_tiles(
     least = np.inf
     for n_tiles in range(1, max(whole) // 16 + 2):
         extent = -(-max(whole) // n_tiles)
-        size = [fft.next_fast_len(min(n, extent + side + 1), real=True) for n in whole]
-        held = _bytes_held((size[0], size[1]), side, n_slabs, workers)
+        size = [find_length(min(n, extent + side + 1)) for n in whole]
+        held = bytes_held((size[0], size[1]), side, n_slabs, shared=shared, workers=workers)
         number = np.prod([-(-n // extent) for n in whole])
         work = number * size[0] * size[1] * np.log2(size[0] * size[1])
         least = min(least, held)
@@ -170,17 +174,6 @@ def plan_tiles(
         for v in range(rim[1], full[1] - rim[1], extent)
     )
     return TilePlan(tiles, held)
-
-
-def _bytes_held(size: tuple[int, int], side: int, n_slabs: int, workers: int) -> float:
-    """Return what the transforms of one tile hold at most: the target's once, per worker its own.
-
-    In words of a cell: two spectra a slab of the target; of each worker spectra of the source, a
-    product, four counts, the score and what the transforms need between (measured: 60 bytes).
-    """
-    n = size[0] * size[1]
-    single = rounding(size, n, side * side) < 0.5
-    return n * (8.0 * n_slabs + 8.0 + 64.0 * workers) * (1.0 if single else 1.8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,41 +260,38 @@ def search_tile(
     spectra = transform_target(
         task.window, (sweep.side, sweep.side), rows=task.seen.rows, columns=task.seen.columns,
         n_source=min(sweep.side**2, len(sweep.columns.xy)), arrays=find_arrays(sweep.arrays),
-        workers=workers,
     )  # fmt: skip
-    one = partial(_search_yaw, task=task, spectra=spectra)
+    some = partial(_search_yaws, task=task, spectra=spectra)
+    starts = range(0, len(sweep.yaws), spectra.at_once)
     with ThreadPoolExecutor(max_workers=workers) as pool:
-        for n, peaks in enumerate(pool.map(one, sweep.yaws)):
-            number = np.full((len(peaks), 1), n)
-            found.append(np.column_stack([number, peaks]) + np.array([*task.first, 0]))
-            tell((n + 1) / len(sweep.yaws))
+        for start, peaks in zip(starts, pool.map(some, starts), strict=True):
+            for n, one in enumerate(peaks, start):
+                number = np.full((len(one), 1), n)
+                found.append(np.column_stack([number, one]) + np.array([*task.first, 0]))
+            tell(min(start + spectra.at_once, len(sweep.yaws)) / len(sweep.yaws))
     return np.concatenate(found)
 
 
-def turn_columns(sweep: Sweep, yaw: float) -> tuple[Bits, Bits]:
-    """Return (occupied, known) bits of the source turned by `yaw`, (side, side)."""
+def turn_columns(sweep: Sweep, yaws: Float64s) -> tuple[Bits, Bits]:
+    """Return (occupied, known) bits of the source turned by each yaw, (side, side, n_yaws)."""
     columns = sweep.columns
-    occupied, known = scatter(
-        columns.xy, columns.occupied, columns.known, math.cos(yaw), math.sin(yaw), sweep.cell,
+    occupied, known = scatter_turns(
+        columns.xy, columns.occupied, columns.known, np.cos(yaws), np.sin(yaws), sweep.cell,
         sweep.low, sweep.side, sweep.side,
     )  # fmt: skip
     return occupied, known
 
 
-def _search_yaw(yaw: float, *, task: Task, spectra: Spectra) -> Float64s:
-    """Return the best separate translations of a tile at one yaw, (n, 3): u, v, score."""
-    sweep = task.sweep
-    occupied, known = turn_columns(sweep, float(yaw))
-    score, _ = evidence_surface(spectra, occupied, known, min_overlap=sweep.min_pairs, workers=1)
-    own, seen = task.tile, task.seen
+def _search_yaws(start: int, *, task: Task, spectra: Spectra) -> list[Float64s]:
+    """Return the best separate translations of a tile, (n, 3): u, v, score, of some yaws."""
+    sweep, own, seen = task.sweep, task.tile, task.seen
+    occupied, known = turn_columns(sweep, sweep.yaws[start : start + spectra.at_once])
     rim = (
         own.rows[0] - seen.rows[0], seen.rows[1] - own.rows[1],
         own.columns[0] - seen.columns[0], seen.columns[1] - own.columns[1],
     )  # fmt: skip
-    index = local_maxima(score, N_PEAKS, 0.0, *rim)
-    index = index[index[:, 0] >= 0]
-    values = score[index[:, 0], index[:, 1]].astype(np.float64)
-    return np.column_stack([index + np.array([seen.rows[0], seen.columns[0]]), values])
+    found = evidence_peaks(spectra, occupied, known, rim, N_PEAKS, min_overlap=sweep.min_pairs)
+    return [peaks + np.array([seen.rows[0], seen.columns[0], 0]) for peaks in found]
 
 
 def _best_of_each_yaw(peaks: Float64s, n_yaws: int) -> list[Float64s]:
@@ -313,38 +303,6 @@ def _best_of_each_yaw(peaks: Float64s, n_yaws: int) -> list[Float64s]:
     peaks = peaks[order]
     ends = np.searchsorted(peaks[:, 0], np.arange(n_yaws + 1))
     return [peaks[low : min(low + N_PEAKS, high), 1:] for low, high in pairwise(ends)]
-
-
-@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
-def local_maxima(score, n_peaks, above, low_u=0, high_u=0, low_v=0, high_v=0):  # type: ignore[no-untyped-def]
-    """Return the indices (n_peaks, 2) of the highest 3x3 local maxima over `above`, else -1.
-
-    So many rows and columns at the rims are only neighbours of the others, and no peaks.
-    """
-    index = np.full((n_peaks, 2), -1, np.int64)
-    value = np.full(n_peaks, -np.inf)
-    n_u, n_v = score.shape
-    for u in range(low_u, n_u - high_u):
-        for v in range(low_v, n_v - high_v):
-            s = score[u, v]
-            if not s > value[-1] or s <= above:
-                continue
-            peak = True
-            for a in range(max(u - 1, 0), min(u + 2, n_u)):
-                for b in range(max(v - 1, 0), min(v + 2, n_v)):
-                    earlier = a < u or (a == u and b < v)
-                    if score[a, b] > s or (earlier and score[a, b] == s):
-                        peak = False
-            if not peak:
-                continue
-            place = n_peaks - 1
-            while place > 0 and s > value[place - 1]:
-                value[place] = value[place - 1]
-                index[place] = index[place - 1]
-                place -= 1
-            value[place] = s
-            index[place, 0], index[place, 1] = u, v
-    return index
 
 
 def _on_cluster(address: str, tasks: Iterator[Task]) -> Iterator[Float64s]:

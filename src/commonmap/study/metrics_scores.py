@@ -17,7 +17,8 @@ import numpy as np
 import scipy.fft
 
 from commonmap.matching.arrays import NUMPY
-from commonmap.matching.evidence import Spectra, evidence_surface, transform_target, xlogx_table
+from commonmap.matching.evidence import xlogx_table
+from commonmap.matching.evidence_fft import Spectra, evidence_surface, transform_target
 from commonmap.matching.roads import Frame, Products, moment_products
 from commonmap.matching.slabs import Bits, SlabGrid
 from commonmap.metrics.plans import MinSum, Moments, Smooth, Sums, Term
@@ -220,7 +221,7 @@ def score_all(target: Target, height: Float64s, known: Bools, occupied: Bits, se
 
     kinds = np.pad(_classes(raw, known, target.top), pad, constant_values=BINS)
     information = class_information(kinds, spans, target.kinds, u, v, BINS, xlogx_table(kinds.size))
-    evidence = evidence_surface(target.slabs, occupied, seen, min_overlap=1.0, workers=1)[0][u, v]
+    evidence = evidence_surface(target.slabs, occupied, seen, min_overlap=1.0)[0][u, v]
 
     value = np.empty((len(COLUMNS), len(n)))
     with np.errstate(all="ignore"):

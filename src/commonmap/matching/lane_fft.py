@@ -1,0 +1,217 @@
+"""Discrete Fourier transforms of eight complex sequences side by side.
+
+Stockham's autosort algorithm in radices 4, 5, 3 and 2 (Van Loan, Computational Frameworks for the
+FFT, 1992, section 1.7): each pass reads one array and writes another, in order, so there is no
+bit reversal, and all that happens inside is arithmetic on `Lanes`. A complex value takes two of
+them, real parts first: a sequence of n is a flat array of n * STEP numbers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from commonmap.matching.lanes import WIDTH, load, store
+
+STEP = 2 * WIDTH
+"""Numbers of a complex value of all lanes."""
+
+_compiled: Any = numba.njit(cache=True, nogil=True, fastmath={"contract"})
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """How sequences of length n are transformed.
+
+    radices: their product is n. roots: (2, m) the factors e^(-2 pi i p k / n) of each pass in the
+    order of their use, real and imaginary. angles: (6,) what the radices 3 and 5 multiply by.
+    """
+
+    n: int
+    radices: NDArray[np.int64]
+    roots: NDArray[np.floating[Any]]
+    angles: NDArray[np.floating[Any]]
+
+
+def find_length(n: int) -> int:
+    """Return the least length of at least n that has no prime factor over 5."""
+    return int(fft.next_fast_len(n, real=True))
+
+
+def plan_transform(n: int, dtype: type[np.floating[Any]]) -> Plan:
+    """Return the plan of a length that `find_length` returns."""
+    radices, rest = [], n
+    for radix in (4, 5, 3, 2):
+        while rest % radix == 0:
+            radices.append(radix)
+            rest //= radix
+    if rest != 1:
+        raise ValueError(f"the length must have the prime factors 2, 3 and 5 alone; {n} came")
+    turns, size = [np.zeros(0)], n
+    for radix in radices:
+        p, k = np.ogrid[: size // radix, 1:radix]
+        turns.append((p * k / size).ravel())
+        size //= radix
+    angle = -2.0 * np.pi * np.concatenate(turns)
+    fifth = 0.4 * np.pi
+    angles = [0.5, np.sin(np.pi / 3.0), *np.cos([fifth, 2 * fifth]), *np.sin([fifth, 2 * fifth])]
+    return Plan(
+        n,
+        np.array(radices, np.int64),
+        np.stack([np.cos(angle), np.sin(angle)]).astype(dtype),
+        np.array(angles, dtype),
+    )
+
+
+@_compiled  # type: ignore[misc]
+def transform_line(a, b, n, radices, roots, angles, sign):  # type: ignore[no-untyped-def]
+    """Transform n complex values in `a`; return whether the answer lies in `b`, not in `a`.
+
+    a, b: flat, n * STEP or longer; both are overwritten. sign: 1 forward, -1 back, not scaled, of
+    the arrays' type.
+    """
+    size, stride, first, swapped = n, 1, 0, False
+    for radix in radices:
+        x, y = (b, a) if swapped else (a, b)
+        if radix == 4:
+            _pass_4(x, y, size, stride, roots, first, sign)
+        elif radix == 2:
+            _pass_2(x, y, size, stride, roots, first, sign)
+        elif radix == 3:
+            _pass_3(x, y, size, stride, roots, first, angles, sign)
+        else:
+            _pass_5(x, y, size, stride, roots, first, angles, sign)
+        first += (radix - 1) * (size // radix)
+        size //= radix
+        stride *= radix
+        swapped = not swapped
+    return swapped
+
+
+@_compiled  # type: ignore[misc]
+def _turn_and_store(y, at, root_r, root_i, real, imaginary):  # type: ignore[no-untyped-def]
+    """Store the complex value times the root."""
+    store(y, at, root_r * real - root_i * imaginary)
+    store(y, at + WIDTH, root_r * imaginary + root_i * real)
+
+
+@_compiled  # type: ignore[misc]
+def _pass_2(x, y, size, stride, roots, first, sign):  # type: ignore[no-untyped-def]
+    m, apart = size // 2, stride * STEP
+    for p in range(m):
+        wr, wi = roots[0, first + p], sign * roots[1, first + p]
+        for q in range(stride):
+            i = (q + stride * p) * STEP
+            j = i + m * apart
+            o = (q + stride * 2 * p) * STEP
+            ar, ai = load(x, i), load(x, i + WIDTH)
+            br, bi = load(x, j), load(x, j + WIDTH)
+            store(y, o, ar + br)
+            store(y, o + WIDTH, ai + bi)
+            _turn_and_store(y, o + apart, wr, wi, ar - br, ai - bi)
+
+
+@_compiled  # type: ignore[misc]
+def _pass_3(x, y, size, stride, roots, first, angles, sign):  # type: ignore[no-untyped-def]
+    m, apart = size // 3, stride * STEP
+    half, height = angles[0], sign * angles[1]
+    for p in range(m):
+        t = first + 2 * p
+        w1r, w1i, w2r, w2i = (
+            roots[0, t],
+            sign * roots[1, t],
+            roots[0, t + 1],
+            sign * roots[1, t + 1],
+        )
+        for q in range(stride):
+            i = (q + stride * p) * STEP
+            j = i + m * apart
+            k = j + m * apart
+            o = (q + stride * 3 * p) * STEP
+            ar, ai = load(x, i), load(x, i + WIDTH)
+            br, bi = load(x, j), load(x, j + WIDTH)
+            cr, ci = load(x, k), load(x, k + WIDTH)
+            sr, si = br + cr, bi + ci
+            dr, di = height * (bi - ci), height * (cr - br)
+            er, ei = ar - half * sr, ai - half * si
+            store(y, o, ar + sr)
+            store(y, o + WIDTH, ai + si)
+            _turn_and_store(y, o + apart, w1r, w1i, er + dr, ei + di)
+            _turn_and_store(y, o + 2 * apart, w2r, w2i, er - dr, ei - di)
+
+
+@_compiled  # type: ignore[misc]
+def _pass_4(x, y, size, stride, roots, first, sign):  # type: ignore[no-untyped-def]
+    m, apart = size // 4, stride * STEP
+    for p in range(m):
+        t = first + 3 * p
+        w1r, w1i, w2r, w2i = (
+            roots[0, t],
+            sign * roots[1, t],
+            roots[0, t + 1],
+            sign * roots[1, t + 1],
+        )
+        w3r, w3i = roots[0, t + 2], sign * roots[1, t + 2]
+        for q in range(stride):
+            i = (q + stride * p) * STEP
+            j = i + m * apart
+            k = j + m * apart
+            n = k + m * apart
+            o = (q + stride * 4 * p) * STEP
+            ar, ai = load(x, i), load(x, i + WIDTH)
+            br, bi = load(x, j), load(x, j + WIDTH)
+            cr, ci = load(x, k), load(x, k + WIDTH)
+            dr, di = load(x, n), load(x, n + WIDTH)
+            acr, aci, bdr, bdi = ar + cr, ai + ci, br + dr, bi + di
+            er, ei, fr, fi = ar - cr, ai - ci, sign * (bi - di), sign * (dr - br)
+            store(y, o, acr + bdr)
+            store(y, o + WIDTH, aci + bdi)
+            _turn_and_store(y, o + apart, w1r, w1i, er + fr, ei + fi)
+            _turn_and_store(y, o + 2 * apart, w2r, w2i, acr - bdr, aci - bdi)
+            _turn_and_store(y, o + 3 * apart, w3r, w3i, er - fr, ei - fi)
+
+
+@_compiled  # type: ignore[misc]
+def _pass_5(x, y, size, stride, roots, first, angles, sign):  # type: ignore[no-untyped-def]
+    m, apart = size // 5, stride * STEP
+    c1, c2, s1, s2 = angles[2], angles[3], sign * angles[4], sign * angles[5]
+    for p in range(m):
+        t = first + 4 * p
+        w1r, w1i, w2r, w2i = (
+            roots[0, t],
+            sign * roots[1, t],
+            roots[0, t + 1],
+            sign * roots[1, t + 1],
+        )
+        w3r, w3i = roots[0, t + 2], sign * roots[1, t + 2]
+        w4r, w4i = roots[0, t + 3], sign * roots[1, t + 3]
+        for q in range(stride):
+            i = (q + stride * p) * STEP
+            j = i + m * apart
+            k = j + m * apart
+            n = k + m * apart
+            h = n + m * apart
+            o = (q + stride * 5 * p) * STEP
+            ar, ai = load(x, i), load(x, i + WIDTH)
+            br, bi = load(x, j), load(x, j + WIDTH)
+            cr, ci = load(x, k), load(x, k + WIDTH)
+            dr, di = load(x, n), load(x, n + WIDTH)
+            er, ei = load(x, h), load(x, h + WIDTH)
+            # the outer and the inner two of the four, their sums and differences
+            ur, ui, vr, vi = br + er, bi + ei, br - er, bi - ei
+            fr, fi, gr, gi = cr + dr, ci + di, cr - dr, ci - di
+            store(y, o, ar + ur + fr)
+            store(y, o + WIDTH, ai + ui + fi)
+            pr, pi = ar + c1 * ur + c2 * fr, ai + c1 * ui + c2 * fi
+            qr, qi = s1 * vi + s2 * gi, s1 * vr + s2 * gr
+            _turn_and_store(y, o + apart, w1r, w1i, pr + qr, pi - qi)
+            _turn_and_store(y, o + 4 * apart, w4r, w4i, pr - qr, pi + qi)
+            pr, pi = ar + c2 * ur + c1 * fr, ai + c2 * ui + c1 * fi
+            qr, qi = s2 * vi - s1 * gi, s2 * vr - s1 * gr
+            _turn_and_store(y, o + 2 * apart, w2r, w2i, pr + qr, pi - qi)
+            _turn_and_store(y, o + 3 * apart, w3r, w3i, pr - qr, pi + qi)

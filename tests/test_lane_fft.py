@@ -1,0 +1,97 @@
+"""Lanes against NumPy, one by one; transforms of eight sequences against NumPy's of each."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+
+from commonmap.matching.lane_fft import STEP, find_length, plan_transform, transform_line
+from commonmap.matching.lanes import WIDTH, clip_below_zero, count_ones, load, spread, store
+
+FLOATS: list[Any] = [np.float32, np.float64]
+
+
+@numba.njit  # type: ignore[misc]
+def _floats(a, b, one, out):  # type: ignore[no-untyped-def]
+    x, y = load(a, 3), load(b, 0)
+    store(out[0], 1, x + y)
+    store(out[1], 1, x - y)
+    store(out[2], 1, x * y)
+    store(out[3], 1, x / y)
+    store(out[4], 1, one - x)
+    store(out[5], 1, x - one)
+    store(out[6], 1, clip_below_zero(x) + spread(one))
+
+
+@numba.njit  # type: ignore[misc]
+def _words(a, b, out):  # type: ignore[no-untyped-def]
+    x, y, by = load(a, 3), load(b, 0), np.uint64(5)
+    store(out[0], 1, x & y)
+    store(out[1], 1, x | y)
+    store(out[2], 1, x << by)
+    store(out[3], 1, x >> by)
+    store(out[4], 1, by & x)
+    store(out[5], 1, count_ones(x) + count_ones(y))
+
+
+@pytest.mark.parametrize("dtype", FLOATS)
+def test_arithmetic_on_lanes_is_that_of_numpy(dtype: Any) -> None:
+    rng = np.random.default_rng(1)
+    a, b = rng.normal(size=14).astype(dtype), rng.uniform(1, 2, 9).astype(dtype)
+    out, one = np.full((7, 10), 9.0, dtype), dtype(0.7)
+    _floats(a, b, one, out)
+    x, y = a[3:11], b[:8]
+    expected = [x + y, x - y, x * y, x / y, one - x, x - one, np.maximum(x, 0) + one]
+    assert np.array_equal(out[:, 1:9], np.stack(expected).astype(dtype))
+    assert np.all(out[:, [0, 9]] == 9.0)  # eight are written, and no other
+
+
+def test_words_on_lanes_are_those_of_numpy() -> None:
+    rng = np.random.default_rng(2)
+    a, b = (rng.integers(0, 2**64, 14, dtype=np.uint64) for _ in range(2))
+    a[4], b[1] = 2**64 - 1, 0
+    out, by = np.zeros((6, 10), np.uint64), np.uint64(5)
+    _words(a, b, out)
+    x, y = a[3:11], b[:8]
+    ones = np.array([bin(int(i)).count("1") + bin(int(j)).count("1") for i, j in zip(x, y,
+                    strict=True)])  # fmt: skip
+    expected = [x & y, x | y, x << by, x >> by, x & by, ones.astype(np.uint64)]
+    assert np.array_equal(out[:, 1:9], np.stack(expected))
+
+
+def test_words_have_no_division() -> None:
+    @numba.njit  # type: ignore[misc]
+    def divide(a):  # type: ignore[no-untyped-def]
+        store(a, 0, load(a, 0) / load(a, 0))
+
+    with pytest.raises(numba.TypingError):
+        divide(np.ones(8, np.uint64))
+
+
+@pytest.mark.parametrize("dtype", FLOATS)
+@pytest.mark.parametrize(
+    "n", [1, 2, 3, 4, 5, 6, 8, 9, 10, 15, 16, 24, 25, 27, 60, 64, 75, 100, 125, 243, 250, 480, 625]
+)
+def test_eight_sequences_transform_as_each_by_itself(n: int, dtype: Any) -> None:
+    rng = np.random.default_rng(n)
+    z = rng.normal(size=(n, WIDTH)) + 1j * rng.normal(size=(n, WIDTH))
+    plan = plan_transform(n, dtype)
+    assert int(np.prod(plan.radices)) == n
+    for sign, expected in ((1, np.fft.fft(z, axis=0)), (-1, np.fft.ifft(z, axis=0) * n)):
+        a = np.stack([z.real, z.imag], axis=1).astype(dtype).ravel()
+        b = np.empty_like(a)
+        swapped = transform_line(a, b, n, plan.radices, plan.roots, plan.angles, dtype(sign))
+        assert swapped == (len(plan.radices) % 2 == 1)
+        found = (b if swapped else a).reshape(n, 2, WIDTH)
+        assert a.size == n * STEP
+        off = np.abs(found[:, 0] + 1j * found[:, 1] - expected).max() / np.abs(expected).max()
+        assert off < 4.0 * np.finfo(dtype).eps
+
+
+def test_lengths_have_small_factors_alone() -> None:
+    assert [find_length(n) for n in (1, 7, 11, 13, 61, 97)] == [1, 8, 12, 15, 64, 100]
+    with pytest.raises(ValueError, match="2, 3 and 5 alone; 14 came"):
+        plan_transform(14, np.float32)
