@@ -115,12 +115,12 @@ def _sharpest(
     while True:
         n_side = 2 * min(8, max(2, math.ceil(width * height / cell))) + 1
         steps = np.linspace(-width, width, n_side)
-        score = np.array([[_shared_pairs(xyz, a + i, b + j, cell) for j in steps] for i in steps])
+        step = float(steps[1] - steps[0])
+        score = _shared_pairs(xyz, a + steps, b + steps, cell)
         i, j = np.unravel_index(int(np.argmax(score)), score.shape)
         if peak_only and (min(i, j) == 0 or max(i, j) == n_side - 1):
             return math.nan, math.nan  # no peak within reach, only a trend
         peak_only = False
-        step = float(steps[1] - steps[0])
         if cell <= finest and step <= FINEST_STEP:
             off_a, off_b = _top_of(steps, score)
             return a + off_a, b + off_b
@@ -164,34 +164,52 @@ def _scatter_of_parts(xyz: Float64s, a: float, b: float) -> float:
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
-def _shared_pairs(xyz, a, b, cell):  # type: ignore[no-untyped-def]
-    """Return how many pairs of points share a plan cell, seen along the direction (a, b, 1).
+def _shared_pairs(xyz, lines_a, lines_b, cell):  # type: ignore[no-untyped-def]
+    """Return how many pairs of points share a plan cell, seen along each direction (a, b, 1).
 
-    Counted on two grids half a cell apart: a wall on a border of one is within a cell of the other.
+    xyz: (N, 3) metres, N < 2^16. lines_a, lines_b: radians, a and b of a grid of directions. Counted
+    on two grids half a cell apart: a wall on a border of one is within a cell of the other.
     """
-    tan_a, tan_b = np.tan(a), np.tan(b)
-    low_x = low_y = np.inf
-    high_x = high_y = -np.inf
-    plan = np.empty((xyz.shape[0], 2), np.float32)
-    for k in range(xyz.shape[0]):
-        x, y = xyz[k, 0] - tan_a * xyz[k, 2], xyz[k, 1] - tan_b * xyz[k, 2]
-        low_x, high_x = min(low_x, x), max(high_x, x)
-        low_y, high_y = min(low_y, y), max(high_y, y)
-        plan[k, 0], plan[k, 1] = x, y
-    n = 64  # cells along a side; what lies further apart is folded onto it
-    while n < 1024 and n * cell < max(high_x - low_x, high_y - low_y) + 2.0 * cell:
-        n *= 2
-    pairs = 0
-    scale, fold = np.float32(1.0 / cell), n - 1
-    count = np.empty((n, n), np.int32)
-    for shift in (np.float32(0.0), np.float32(0.5)):
-        count[:] = 0
+    n = xyz.shape[0]
+    i, n_i = _plan_cells(xyz, 0, lines_a, cell)
+    j, n_j = _plan_cells(xyz, 1, lines_b, cell)
+    count = np.empty(n_i * n_j, np.uint16)
+    pairs = np.zeros((lines_a.shape[0], lines_b.shape[0]))
+    for p in range(lines_a.shape[0]):
+        for q in range(lines_b.shape[0]):
+            total = 0
+            for shift in range(2):
+                count[:] = 0
+                for k in range(n):
+                    place = i[p, shift, k] * n_j + j[q, shift, k]
+                    total += count[place]
+                    count[place] += np.uint16(1)
+            pairs[p, q] = total
+    return pairs
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _plan_cells(xyz, axis, lines, cell):  # type: ignore[no-untyped-def]
+    """Return the cells (n_lines, 2, N) along an axis of the plan, on both grids, and their number.
+
+    At most 1024 cells along a side: what lies further apart is folded onto them.
+    """
+    out = np.empty((lines.shape[0], 2, xyz.shape[0]), np.int32)
+    span, scale = 0.0, 1.0 / cell
+    for p in range(lines.shape[0]):
+        slope, low, high = np.tan(lines[p]), np.inf, -np.inf
         for k in range(xyz.shape[0]):
-            i = np.int32(np.floor(plan[k, 0] * scale + shift)) & fold
-            j = np.int32(np.floor(plan[k, 1] * scale + shift)) & fold
-            pairs += count[i, j]
-            count[i, j] += 1
-    return float(pairs)
+            x = xyz[k, axis] - slope * xyz[k, 2]
+            low, high = min(low, x), max(high, x)
+            at = x * scale
+            out[p, 0, k] = np.int32(np.floor(at))
+            out[p, 1, k] = np.int32(np.floor(at + 0.5))
+        span = max(span, high - low)
+    n = 64
+    while n < 1024 and n * cell < span + 2.0 * cell:
+        n *= 2
+    out &= np.int32(n - 1)
+    return out, n
 
 
 def _rough_up(xyz: Float64s) -> tuple[Float64s, bool]:

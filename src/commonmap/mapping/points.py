@@ -27,9 +27,8 @@ def points_of(item: Cloud | Leaves | Float64s, name: str = "map") -> Float64s:
         xyz = voxel_centres(item)
     else:
         xyz = check_points(item.xyz if isinstance(item, Cloud) else item, name)
-    finite = np.isfinite(xyz).all(axis=1)
-    if not finite.all():
-        xyz = xyz[finite]
+    if not _all_finite(xyz.reshape(-1)):
+        xyz = xyz[np.isfinite(xyz).all(axis=1)]
     if len(xyz) == 0:
         kind = "occupied voxel" if isinstance(item, Leaves) else "finite point"
         raise EmptyMapError(f"the {name} holds no {kind}; a map needs at least a few hundred")
@@ -134,9 +133,26 @@ def _group(xyz: Float64s, voxel: float) -> tuple[NDArray[np.int64], NDArray[np.i
     if np.prod(shape) >= 2.0**62:
         shape = np.full(3, 2.0**20)  # folded onto as many voxels as can be numbered
     key = _voxel_keys(xyz, 1.0 / voxel, low, shape.astype(np.int64))
+    if np.prod(shape) < 2.0**31:
+        key = key.astype(np.int32)  # half the bytes to sort
     order, key = _sort(key)
-    edges = np.nonzero(np.diff(key))[0] + 1
-    return order, np.concatenate([[0], edges, [len(key)]]).astype(np.int64)
+    return order, np.asarray(_starts(key))
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _starts(key):  # type: ignore[no-untyped-def]
+    """Return where each value of sorted keys begins, and behind the last of them their number."""
+    n = 1 if key.shape[0] > 0 else 0
+    for i in range(1, key.shape[0]):
+        n += key[i] != key[i - 1]
+    starts = np.empty(n + 1, np.int64)
+    m = 0
+    for i in range(key.shape[0]):
+        if i == 0 or key[i] != key[i - 1]:
+            starts[m] = i
+            m += 1
+    starts[n] = key.shape[0]
+    return starts
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
@@ -204,9 +220,19 @@ def _move(T, xyz):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
 def _bounds(xyz: NDArray[np.float64]):  # type: ignore[no-untyped-def]
-    low, high = xyz[0].copy(), xyz[0].copy()
+    x0, y0, z0 = xyz[0]
+    x1, y1, z1 = xyz[0]
     for n in range(xyz.shape[0]):
-        for a in range(3):
-            low[a] = min(low[a], xyz[n, a])
-            high[a] = max(high[a], xyz[n, a])
-    return low, high
+        x, y, z = xyz[n, 0], xyz[n, 1], xyz[n, 2]
+        x0, y0, z0 = min(x0, x), min(y0, y), min(z0, z)
+        x1, y1, z1 = max(x1, x), max(y1, y), max(z1, z)
+    return np.array([x0, y0, z0]), np.array([x1, y1, z1])
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _all_finite(values):  # type: ignore[no-untyped-def]
+    """Return whether no value is infinite or not a number: such a one times zero is no number."""
+    total = 0.0
+    for value in values:
+        total += value * 0.0
+    return total == 0.0

@@ -500,12 +500,18 @@ def _find_peaks(  # type: ignore[no-untyped-def]
 def _bound_scores(row, counts, first_column, n_columns, bound):  # type: ignore[no-untyped-def]
     """Set bound (n_columns * WIDTH) to what no score of the row exceeds, by arithmetic alone.
 
-    n MI <= n phi^2, as no divergence of Kullback exceeds ln(1 + chi^2), and phi is the table's
-    correlation; n H(p) >= 4 ln 2 n p (1 - p). What rounding may take away here is added: 1 % and
+    With d = n n11 - r c, n11 is (1 + x) times what independence expects, x = d / (r c), and so are
+    the others: x = d / ((n - r) (n - c)) for n00, -d / (r (n - c)) and -d / ((n - r) c) for n10 and
+    n01. As (1 + x) ln(1 + x) <= x + x^2 / 2 for x >= 0, and <= x + x^2 / 2 - x^3 / 2 from -1 to 0,
+
+        n MI <= d^2 / 2 (n A B + (A^2 + B^2) d / n),  A = 1 / (r (n - c)),  B = 1 / ((n - r) c)
+
+    for d > 0. And n H(p) >= 4 ln 2 n p (1 - p). What rounding may take away here is added: 1 % and
     a tenth of a nat.
     """
     number = row.dtype.type
-    zero, tiny, more, slack = number(0), number(1e-3), number(1.01), number(0.1)
+    zero, one, tiny = number(0), number(1), number(1e-3)
+    half, slack = number(0.5 * 1.01), number(0.1)
     entropy, prior = number(4.0 * np.log(2.0)), number(DOUBT)
     # added and taken away, it leaves a whole number
     magic = number(1.5 * 2.0**23) if row.itemsize == 4 else number(1.5 * 2.0**52)
@@ -517,15 +523,16 @@ def _bound_scores(row, counts, first_column, n_columns, bound):  # type: ignore[
             n = -magic + (magic + load(row[place >> 1], at + (place & 1) * WIDTH))
             place = counts[k, 1]
             r = -magic + (magic + load(row[place >> 1], at + (place & 1) * WIDTH))
-            split = r * (n - r)
-            doubt = doubt + split / (tiny + n)
+            share = one / (tiny + n)
+            doubt = doubt + r * (n - r) * share
             if counts[k, 2] < 0:
                 continue
             place = counts[k, 2]
             c = -magic + (magic + load(row[place >> 1], at + (place & 1) * WIDTH))
             place = counts[k, 3]
             both = -magic + (magic + load(row[place >> 1], at + (place & 1) * WIDTH))
-            surplus = clip_below_zero(n * both - r * c)
-            evidence = evidence + n * surplus * surplus / (tiny + split * c * (n - c))
-        evidence = slack + more * evidence
+            d = clip_below_zero(n * both - r * c)
+            A, B = one / (tiny + r * (n - c)), one / (tiny + (n - r) * c)
+            evidence = evidence + half * d * d * (n * A * B + d * share * (A * A + B * B))
+        evidence = slack + evidence
         store(bound, v * WIDTH, evidence * evidence / (prior + entropy * doubt))
