@@ -19,6 +19,7 @@ from commonmap.matching.evidence import (
     xlogx_table,
 )
 from commonmap.matching.evidence_fft import (
+    _bound_scores,
     evidence_peaks,
     evidence_surface,
     evidence_surfaces,
@@ -274,6 +275,36 @@ def test_the_bound_holds_where_the_evidence_is_all_there_is() -> None:
     assert peaks[0, :2].tolist() == [39, 29]
     score, _ = evidence_surface(spectra, occupied[..., 0], known[..., 0], min_overlap=9.0)
     assert peaks[0, 2] == score[39, 29] == score.max()
+
+
+@pytest.mark.parametrize("n", [2, 7, 40])
+def test_no_table_scores_more_than_its_bound(n: int) -> None:
+    tables = np.array(
+        [
+            (n, r, c, both)
+            for r in range(n + 1)
+            for c in range(n + 1)
+            for both in range(max(0, r + c - n), min(r, c) + 1)
+        ]
+    )
+    tables = np.concatenate([tables, np.repeat(tables[-1:], -len(tables) % 8, axis=0)])
+    # two slabs with the same table: the counts as `_find_peaks` has them, in two complex products
+    lanes = tables.T.reshape(4, -1, 8).astype(np.float32)
+    row = np.stack([lanes[:2], lanes[2:]]).swapaxes(1, 2).reshape(2, -1)
+    bound = np.empty(len(tables), np.float32)
+    counts = np.array([[0, 1, 2, 3], [0, 1, 2, 3]])
+    _bound_scores(np.ascontiguousarray(row), counts, 0, len(tables) // 8, bound)
+    xlogx = xlogx_table(n)
+    score = np.array(
+        [
+            weigh(2.0 * signed_evidence(k, r, c, both, xlogx), 2.0 * uncertainty(k, r, xlogx))
+            for k, r, c, both in tables.tolist()
+        ]
+    )
+    assert np.all(score <= bound)
+    if n == 40:  # and not so much more: what chance finds stays out
+        weak = (score > 0.0) & (score < 0.2)
+        assert np.median(bound[weak] - score[weak]) < 0.1
 
 
 def test_counts_share_complex_values() -> None:

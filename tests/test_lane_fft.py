@@ -8,8 +8,23 @@ import numba
 import numpy as np
 import pytest
 
-from commonmap.matching.lane_fft import STEP, find_length, plan_transform, transform_line
-from commonmap.matching.lanes import WIDTH, clip_below_zero, count_ones, load, spread, store
+from commonmap.matching.lane_fft import (
+    STEP,
+    find_length,
+    plan_transform,
+    transform_columns,
+    transform_line,
+)
+from commonmap.matching.lanes import (
+    WIDTH,
+    clip_below_zero,
+    count_ones,
+    load,
+    load_pairs,
+    spread,
+    store,
+    store_pairs,
+)
 
 FLOATS: list[Any] = [np.float32, np.float64]
 
@@ -89,6 +104,44 @@ def test_eight_sequences_transform_as_each_by_itself(n: int, dtype: Any) -> None
         assert a.size == n * STEP
         off = np.abs(found[:, 0] + 1j * found[:, 1] - expected).max() / np.abs(expected).max()
         assert off < 4.0 * np.finfo(dtype).eps
+
+
+@numba.njit  # type: ignore[misc]
+def _pairs(a, out):  # type: ignore[no-untyped-def]
+    even, odd = load_pairs(a, 3)
+    store(out, 1, even)
+    store(out, 9, odd)
+    store_pairs(out, 18, odd, even)
+
+
+@pytest.mark.parametrize("dtype", FLOATS)
+def test_pairs_come_apart_and_together(dtype: Any) -> None:
+    a, out = np.arange(20, dtype=dtype), np.full(35, -1.0, dtype)
+    _pairs(a, out)
+    assert out[1:9].tolist() == [3, 5, 7, 9, 11, 13, 15, 17]
+    assert out[9:17].tolist() == [4, 6, 8, 10, 12, 14, 16, 18]
+    assert out[18:34].tolist() == [4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15, 18, 17]
+    assert out[[0, 17, 34]].tolist() == [-1, -1, -1]
+
+
+@pytest.mark.parametrize("dtype", FLOATS)
+@pytest.mark.parametrize("width", [1, 7, 8, 21])
+@pytest.mark.parametrize("n_in", [1, 20, 24])
+def test_columns_transform_as_numpy_has_it(n_in: int, width: int, dtype: Any) -> None:
+    rng = np.random.default_rng([n_in, width])
+    z = rng.normal(size=(n_in, width)) + 1j * rng.normal(size=(n_in, width))
+    z = z.astype(np.result_type(dtype, np.complex64))
+    plan = plan_transform(24, dtype)
+    out = np.full((24, width), np.nan, z.dtype)
+    for sign, scale, expected in (
+        (1, 1.0, np.fft.fft(z, n=24, axis=0)),
+        (-1, 1 / 24, np.fft.ifft(z, n=24, axis=0)),
+    ):
+        transform_columns(
+            z.view(dtype).ravel(), out.view(dtype).reshape(-1), n_in, width, 24, plan.radices,
+            plan.roots, plan.angles, dtype(sign), dtype(scale),
+        )  # fmt: skip
+        assert np.abs(out - expected).max() < 8.0 * np.finfo(dtype).eps * np.abs(expected).max()
 
 
 def test_lengths_have_small_factors_alone() -> None:

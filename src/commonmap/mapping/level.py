@@ -167,8 +167,8 @@ def _scatter_of_parts(xyz: Float64s, a: float, b: float) -> float:
 def _shared_pairs(xyz, lines_a, lines_b, cell):  # type: ignore[no-untyped-def]
     """Return how many pairs of points share a plan cell, seen along each direction (a, b, 1).
 
-    xyz: (N, 3) metres, N < 2^16. lines_a, lines_b: radians, a and b of a grid of directions. Counted
-    on two grids half a cell apart: a wall on a border of one is within a cell of the other.
+    xyz: (N, 3) metres, N < 2^16. lines_a, lines_b: radians, a and b of a grid of directions.
+    Counted on two grids half a cell apart: a wall on a border of one is within a cell of the other.
     """
     n = xyz.shape[0]
     i, n_i = _plan_cells(xyz, 0, lines_a, cell)

@@ -18,6 +18,7 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from commonmap.errors import InputError, MissingExtraError
+from commonmap.matching.lane_fft import find_length, plan_transform, transform_columns
 
 Array = Any
 
@@ -73,7 +74,7 @@ def choose_shape(
         full = target_shape[axis] + source_shape[axis] - 1
         spare = max(0, (min_cells - 1) // other, rim[axis])
         need = max(full - spare, target_shape[axis], source_shape[axis])
-        lengths.append(int(scipy.fft.next_fast_len(need, real=axis == 1)))
+        lengths.append(find_length(need))
     return lengths[0], lengths[1]
 
 
@@ -122,29 +123,51 @@ def transform(
 ) -> Array:
     """Return the spectra of the layers, padded with zeros to `shape`; empty rows are skipped.
 
-    role: of the array to borrow for them; without one they have an array of their own.
+    role: of the array to borrow for them; without one they have an array of their own. workers:
+    threads along the second axis, on the CPU. There the first axis takes the lengths of
+    `lane_fft.find_length`.
     """
-    options = {"workers": workers} if arrays.threads else {}
     one = np.result_type(layers.dtype, np.complex64)
     out = borrow(arrays, role, (layers.shape[0], shape[0], shape[1] // 2 + 1), one)
     for k in range(layers.shape[0]):
-        rows = arrays.fft.rfft(layers[k], n=shape[1], axis=-1, **options)
-        out[k] = arrays.fft.fft(rows, n=shape[0], axis=-2, **options)
+        if arrays.threads:
+            rows = arrays.fft.rfft(layers[k], n=shape[1], axis=-1, workers=workers)
+            _transform_first_axis(rows, out[k], 1)
+        else:
+            rows = arrays.fft.rfft(layers[k], n=shape[1], axis=-1)
+            out[k] = arrays.fft.fft(rows, n=shape[0], axis=-2)
     return out
 
 
 def invert(
     arrays: Arrays, spectra: Array, shape: tuple[int, int], workers: int, role: str = ""
 ) -> Array:
-    """Return the layers (m, Nx, Ny) of the spectra, which are overwritten; role as above."""
-    options: dict[str, Any] = {"overwrite_x": True}
-    if arrays.threads:
-        options["workers"] = workers
+    """Return the layers (m, Nx, Ny) of the spectra, which are overwritten; the rest as above."""
     out = borrow(arrays, role, (spectra.shape[0], *shape), spectra.real.dtype)
     for k in range(spectra.shape[0]):
-        columns = arrays.fft.ifft(spectra[k], axis=-2, **options)
-        out[k] = arrays.fft.irfft(columns, n=shape[1], axis=-1, **options)
+        if arrays.threads:
+            _transform_first_axis(spectra[k], spectra[k], -1)
+            out[k] = arrays.fft.irfft(
+                spectra[k], n=shape[1], axis=-1, overwrite_x=True, workers=workers
+            )
+        else:
+            columns = arrays.fft.ifft(spectra[k], axis=-2, overwrite_x=True)
+            out[k] = arrays.fft.irfft(columns, n=shape[1], axis=-1, overwrite_x=True)
     return out
+
+
+def _transform_first_axis(values: Array, out: Array, sign: int) -> None:
+    """Set out (n, m) to the transform of complex values (n_in, m) along their first axis.
+
+    sign: 1 forward; -1 back, divided by n.
+    """
+    number = out.real.dtype.type
+    n, width = out.shape
+    plan = plan_transform(n, number)
+    transform_columns(
+        values.view(number).reshape(-1), out.view(number).reshape(-1), len(values), width, n,
+        plan.radices, plan.roots, plan.angles, number(sign), number(1.0 if sign > 0 else 1.0 / n),
+    )  # fmt: skip
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract", "nsz"})

@@ -9,6 +9,7 @@ them, real parts first: a sequence of n is a flat array of n * STEP numbers.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numba
@@ -16,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from commonmap.matching.lanes import WIDTH, load, store
+from commonmap.matching.lanes import WIDTH, load, load_pairs, store, store_pairs
 
 STEP = 2 * WIDTH
 """Numbers of a complex value of all lanes."""
@@ -43,6 +44,7 @@ def find_length(n: int) -> int:
     return int(fft.next_fast_len(n, real=True))
 
 
+@lru_cache(maxsize=256)
 def plan_transform(n: int, dtype: type[np.floating[Any]]) -> Plan:
     """Return the plan of a length that `find_length` returns."""
     radices, rest = [], n
@@ -91,6 +93,40 @@ def transform_line(a, b, n, radices, roots, angles, sign):  # type: ignore[no-un
         stride *= radix
         swapped = not swapped
     return swapped
+
+
+@_compiled  # type: ignore[misc]
+def transform_columns(x, y, n_in, width, n, radices, roots, angles, sign, scale):  # type: ignore[no-untyped-def]
+    """Transform along the first axis of (n_in, width) complex values, filled up with zeros to n.
+
+    x, y: flat, real and imaginary parts in turn, the values and the answer (n, width); they may be
+    the same. scale: the answer is multiplied by it, of the arrays' type as the sign.
+    """
+    a, b = np.empty(n * STEP, y.dtype), np.empty(n * STEP, y.dtype)
+    for start in range(0, width, WIDTH):
+        rest = min(WIDTH, width - start)
+        if rest < WIDTH:
+            a[:] = 0
+        for i in range(n_in):
+            at = 2 * (i * width + start)
+            if rest == WIDTH:
+                real, imaginary = load_pairs(x, at)
+                store(a, i * STEP, real)
+                store(a, i * STEP + WIDTH, imaginary)
+            else:
+                for w in range(rest):
+                    a[i * STEP + w], a[i * STEP + WIDTH + w] = x[at + 2 * w], x[at + 2 * w + 1]
+        a[n_in * STEP :] = 0
+        line = b if transform_line(a, b, n, radices, roots, angles, sign) else a
+        for i in range(n):
+            at = 2 * (i * width + start)
+            if rest == WIDTH:
+                real, imaginary = load(line, i * STEP), load(line, i * STEP + WIDTH)
+                store_pairs(y, at, scale * real, scale * imaginary)
+            else:
+                for w in range(rest):
+                    y[at + 2 * w] = scale * line[i * STEP + w]
+                    y[at + 2 * w + 1] = scale * line[i * STEP + WIDTH + w]
 
 
 @_compiled  # type: ignore[misc]

@@ -12,6 +12,7 @@ Of floating point there is `+ - * /`, of words of 64 bits `+ & | << >>` and `cou
 from __future__ import annotations
 
 import operator
+from collections.abc import Iterable
 from typing import Any
 
 from llvmlite import ir
@@ -79,6 +80,44 @@ def store(typing: Any, array: Any, index: Any, lanes: Any) -> Any:
 
 
 @_compiled
+def load_pairs(typing: Any, array: Any, index: Any) -> Any:
+    """Return what `array[index : index + 2 WIDTH]` holds at even and at odd places, as lanes."""
+    lanes = Lanes(array.dtype)
+
+    def write(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        wide = ir.VectorType(context.get_value_type(lanes).element, 2 * WIDTH)
+        array, index = (signature.args[0], args[0]), args[1]
+        found = builder.load(_place(context, builder, array, index, wide))
+        found.align = array[0].dtype.bitwidth // 8
+        halves = [_shuffle(builder, found, found, range(first, 2 * WIDTH, 2)) for first in (0, 1)]
+        return context.make_tuple(builder, signature.return_type, halves)
+
+    return types.UniTuple(lanes, 2)(array, types.intp), write  # type: ignore[no-untyped-call]
+
+
+@_compiled
+def store_pairs(typing: Any, array: Any, index: Any, even: Any, odd: Any) -> Any:
+    """Set `array[index : index + 2 WIDTH]` at even and at odd places to the lanes."""
+
+    def write(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        wide = ir.VectorType(context.get_value_type(signature.args[2]).element, 2 * WIDTH)
+        there = _place(context, builder, (signature.args[0], args[0]), args[1], wide)
+        order = [k // 2 + k % 2 * WIDTH for k in range(2 * WIDTH)]
+        both = _shuffle(builder, args[2], args[3], order)
+        builder.store(both, there).align = signature.args[0].dtype.bitwidth // 8
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, even, odd), write
+
+
+def _shuffle(builder: Any, a: Any, b: Any, order: Iterable[int]) -> Any:
+    """Return the values of two vectors, counted on from the first to the second, in an order."""
+    places = list(order)
+    kind = ir.VectorType(ir.IntType(32), len(places))
+    return builder.shuffle_vector(a, b, ir.Constant(kind, places))
+
+
+@_compiled
 def clip_below_zero(typing: Any, lanes: Any) -> Any:
     """Return the lanes, zero where they are negative."""
 
@@ -103,8 +142,7 @@ def _spread(context: Any, builder: Any, lanes: Any, number: Any) -> Any:
     vector = context.get_value_type(lanes)
     nothing, first = ir.Constant(vector, ir.Undefined), ir.Constant(ir.IntType(32), 0)
     one = builder.insert_element(nothing, number, first)
-    everywhere = ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH)
-    return builder.shuffle_vector(one, nothing, everywhere)
+    return _shuffle(builder, one, nothing, [0] * WIDTH)
 
 
 @_compiled

@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-import scipy.fft
 
 from commonmap.matching.arrays import NUMPY
 from commonmap.matching.evidence import xlogx_table
 from commonmap.matching.evidence_fft import Spectra, evidence_surface, transform_target
+from commonmap.matching.lane_fft import find_length
 from commonmap.matching.roads import Frame, Products, moment_products
 from commonmap.matching.slabs import Bits, SlabGrid
 from commonmap.metrics.plans import MinSum, Moments, Smooth, Sums, Term
@@ -135,9 +135,7 @@ def prepare(
     in both are not scored.
     """
     (tx, ty), (sx, sy) = height_t.shape, source_shape
-    size = (
-        scipy.fft.next_fast_len(tx + sx - 1), scipy.fft.next_fast_len(ty + sy - 1, real=True)
-    )  # fmt: skip
+    size = find_length(tx + sx - 1), find_length(ty + sy - 1)
     frame = Frame(NUMPY, size, source_shape, (tx + sx - 1, ty + sy - 1), np.float64)
     raw = np.where(known_t, height_t, 0.0)
     lifted = np.where(known_t, np.maximum(raw, floor), 0.0)
