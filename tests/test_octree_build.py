@@ -19,7 +19,7 @@ from commonmap.io.octomap import read_octree, write_octree
 from commonmap.io.trajectory import write_trajectory
 from commonmap.mapping.octree import Octree, log_odds, octree_from_points, probability
 from commonmap.mapping.octree_build import insert_cloud, insert_log
-from commonmap.odometry import Odometry, ScanHealth
+from commonmap.odometry import Odometry, PlaceableTurns, ScanHealth
 from commonmap.sim.logs import write_kitti
 from commonmap.sim.missions import Area, drive
 from commonmap.sim.scanning import RayCaster, scan_world, split_scans, turn_stamps
@@ -103,6 +103,21 @@ def test_turns_at_no_known_pose_are_left_out() -> None:
     assert sorted(tree.occupied_centres()[:, 0].tolist()) == [0.5, 2.5, 3.5]
     with pytest.raises(EmptyMapError, match="none of 1 turns"):
         insert_log(scans[4:], Octree(1.0), known(line()))
+
+
+def test_only_the_longest_part_that_holds_together_is_mapped() -> None:
+    scans = [scan_of([[0, 2, 0]], [0.1 * k + 0.05], 0.1 * k) for k in range(14)]
+    lost = [*[False] * 3, *[True] * 6, *[False] * 5]  # lost for long: how both parts lie is a guess
+    health = [
+        ScanHealth(0.1 * k, 100, 1.0, 0.01, np.zeros((0, 6)), gone) for k, gone in enumerate(lost)
+    ]
+    tree = Octree(1.0)
+    odometry = Odometry("loam", line(14), tuple(health))
+    assert insert_log(scans, tree, odometry) == 9
+    assert sorted(tree.occupied_centres()[:, 0].tolist()) == [9.5, 10.5, 11.5, 12.5, 13.5]
+    turns = PlaceableTurns(odometry, scans, every=2)
+    assert [scan.stamp for scan in turns] == pytest.approx([1.0, 1.2])
+    assert (turns.n, turns.n_left_out, turns.n_apart, turns.sound) == (14, 9, 3, range(9, 14))
 
 
 def test_a_cloud_without_origins_gives_ends_alone() -> None:

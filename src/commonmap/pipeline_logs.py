@@ -20,12 +20,11 @@ from commonmap.odometry import (
     Accumulator,
     LoamOptions,
     Odometry,
+    PlaceableTurns,
     TrajectoryErrors,
     Trouble,
-    covers,
     describe_health,
     estimate,
-    find_sound_part,
     find_troubles,
     georeference,
 )
@@ -104,9 +103,8 @@ def map_log(
     # 2. every point at its place, deskewed; what lies in one voxel is kept once: (N, 3)
     gathered = Accumulator(max_points=max_points)
     turns = _telling(read(), f"map of {name}", share, progress)
-    counted = _Counter(answer)
-    placeable = counted.placeable(answer.as_taken(turns))
-    for cloud in georeference(placeable, answer.trajectory):
+    counted = PlaceableTurns(answer, turns)
+    for cloud in georeference(counted, answer.trajectory):
         gathered.add(cloud)
     cloud = gathered.cloud()
 
@@ -185,40 +183,6 @@ def _telling(
             progress(step, share())
 
 
-class _Counter:
-    """Passes on the turns whose pose is known, and counts all and the others.
-
-    Turns before and after the longest part that holds together are left out too: how they lie to
-    it is a guess (`n_apart`).
-    """
-
-    def __init__(self, answer: Odometry):
-        self.n = self.n_left_out = self.n_apart = 0
-        self._trajectory = answer.trajectory
-        self._lost = [h.lost for h in answer.health]
-        self.sound = find_sound_part(answer.health)
-
-    @property
-    def sound_way(self) -> Trajectory:
-        """The poses of the part that is mapped."""
-        if not self._lost:
-            return self._trajectory
-        part = slice(self.sound.start, self.sound.stop)
-        return Trajectory(self._trajectory.time[part], self._trajectory.T_map_sensor[part])
-
-    def placeable(self, scans: Iterable[Scan]) -> Iterator[Scan]:
-        for scan in scans:
-            known = self.n < len(self._lost)
-            lost = known and self._lost[self.n]
-            apart = known and not lost and self.n not in self.sound
-            self.n += 1
-            self.n_apart += apart
-            if lost or apart or not covers(self._trajectory, scan):
-                self.n_left_out += 1
-            else:
-                yield scan
-
-
 def _require_some(answer: Odometry, name: str) -> None:
     if answer.n_lost > LOST_SHARE * max(len(answer.health), 1):
         raise InputError(
@@ -236,7 +200,7 @@ def _turned(answer: Odometry, T: Float64s) -> Odometry:
     return replace(answer, trajectory=trajectory, health=health, notes=notes)
 
 
-def _notes(answer: Odometry, levelling: Levelling, counted: _Counter) -> tuple[str, ...]:
+def _notes(answer: Odometry, levelling: Levelling, counted: PlaceableTurns) -> tuple[str, ...]:
     notes = [*answer.notes]
     if counted.n_apart:
         way = counted.sound_way.time

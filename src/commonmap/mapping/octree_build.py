@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from commonmap.errors import EmptyMapError, InputError
 from commonmap.mapping.octree import Octree
-from commonmap.odometry import Odometry, covers, georeference
+from commonmap.odometry import Odometry, PlaceableTurns, georeference
 from commonmap.types import Cloud, Float64s, Progress, Scan, Trajectory, no_progress
 
 TURN = 0.1
@@ -39,27 +39,27 @@ def insert_log(
     """Insert every turn of a log into `tree`; return how many were left out.
 
     Every ray begins where the sensor was at its own moment. A turn is left out where its pose is
-    only a guess (odometry was lost) or not known.
+    only a guess or not known, and where odometry was lost too long between it and the longest part
+    (`odometry.PlaceableTurns`).
     scans: all turns of the log, read once. odometry: the poses of the sensor.
     max_range, discretize: as of `Octree.insert`. shift: (3,) metres, taken from all coordinates.
     n_scans: how many there are, where known, for the progress.
     """
     progress("insert the turns")
-    placed = n_points = 0
-    turns = _Placeable(scans, odometry)
+    n_points = 0
+    turns = PlaceableTurns(odometry, scans)
     for cloud in georeference(turns, odometry.trajectory):
         assert cloud.origin is not None
         tree.insert(
             cloud.origin - shift, cloud.xyz - shift, max_range=max_range, discretize=discretize
         )
-        placed += 1
         n_points += len(cloud.xyz)
         progress("insert the turns", min(turns.n / n_scans, 1.0) if n_scans else 0.0)
     if n_points == 0:
         raise EmptyMapError(
             f"an octree needs points; none of {turns.n} turns has any at a known pose"
         )
-    return turns.n - placed
+    return turns.n_left_out
 
 
 def insert_cloud(
@@ -101,22 +101,6 @@ def insert_cloud(
         tree.insert(starts[turn] - shift, xyz[turn], max_range=max_range, discretize=discretize)
         progress("insert the points", (number + 1) / len(turns))
     return True
-
-
-class _Placeable:
-    """Passes on the turns whose pose is known, and counts all."""
-
-    def __init__(self, scans: Iterable[Scan], odometry: Odometry) -> None:
-        self.n = 0
-        self._scans = odometry.as_taken(scans)
-        self._trajectory = odometry.trajectory
-        self._lost = {n for n, health in enumerate(odometry.health) if health.lost}
-
-    def __iter__(self) -> Iterator[Scan]:
-        for number, scan in enumerate(self._scans):
-            self.n = number + 1
-            if number not in self._lost and covers(self._trajectory, scan):
-                yield scan
 
 
 def _origins(

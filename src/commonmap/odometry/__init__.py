@@ -4,6 +4,7 @@ from commonmap.odometry.accumulate import Accumulator
 from commonmap.odometry.errors import TrajectoryErrors, compare
 from commonmap.odometry.georeference import covers, georeference
 from commonmap.odometry.loam import LoamOptions
+from commonmap.odometry.placeable import PlaceableTurns
 from commonmap.odometry.records import Odometry, ScanHealth, Trouble
 from commonmap.odometry.table import (
     ODOMETRY,
@@ -20,6 +21,7 @@ __all__ = [
     "LoamOptions",
     "Odometry",
     "OdometryMethod",
+    "PlaceableTurns",
     "ScanHealth",
     "TrajectoryErrors",
     "Trouble",

@@ -25,7 +25,7 @@ from commonmap.matching.refine import lift, refine
 from commonmap.matching.search import Peaks
 from commonmap.matching.search_metric import search_metric
 from commonmap.merging.products import CommonMap
-from commonmap.odometry import TrajectoryErrors, compare, covers, georeference
+from commonmap.odometry import PlaceableTurns, TrajectoryErrors, compare, georeference
 from commonmap.pipeline import match_maps, merge_maps
 from commonmap.pipeline_logs import RobotMap
 from commonmap.sim.pairs import Plan, plan_missions
@@ -40,7 +40,7 @@ from commonmap.study.readings import (
     score_pose,
     search_readings,
 )
-from commonmap.types import Float64s, GridMap, Leaves, Match, Progress, Scan, no_progress
+from commonmap.types import Float64s, GridMap, Leaves, Match, Progress, no_progress
 
 SECONDS = 60.0
 """Length of the logs, at most."""
@@ -216,16 +216,9 @@ def run_experiment(
 def make_octree(path: Path, robot: RobotMap, *, progress: Progress = no_progress) -> Leaves:
     """Return the octree of a log's turns, in the frame of its map."""
     every = max(1, robot.n_turns // TURNS)
-    trajectory, health = robot.trajectory, robot.odometry.health
-
-    def chosen() -> Iterator[Scan]:
-        for number, scan in enumerate(robot.odometry.as_taken(iter_scans(path))):
-            lost = number < len(health) and health[number].lost
-            if number % every == 0 and not lost and covers(trajectory, scan):
-                yield scan
-
+    turns = PlaceableTurns(robot.odometry, iter_scans(path), every=every)
     tree = Octree(VOXEL)
-    for number, cloud in enumerate(georeference(chosen(), trajectory)):
+    for number, cloud in enumerate(georeference(turns, robot.trajectory)):
         assert cloud.origin is not None
         tree.insert(cloud.origin, cloud.xyz)
         step = f"octree of {path.parent.name}/{path.name}"
