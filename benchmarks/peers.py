@@ -2,6 +2,7 @@
 
     python benchmarks/peers.py                         # runs what has no record yet, then the table
     python benchmarks/peers.py run --peers kiss-matcher akay-k --python /path/to/other/python
+    python benchmarks/peers.py run --again             # everything anew: all times in one run
     python benchmarks/peers.py table                   # writes the tables into README and docs
 
 Every run is a process of its own on one core, with a limit of 120 s of CPU time. Its answer goes,
@@ -114,11 +115,14 @@ def key_of(case: str, name: str, revision: str) -> tuple[str, str, str]:
     return case, name, revision if name == OURS else ""
 
 
-def run_all(folder: Path, peers: list[str], other: str | None) -> None:
-    """Append a record for each case and peer that has none; our own needs one of this revision."""
+def run_all(folder: Path, peers: list[str], other: str | None, *, again: bool) -> None:
+    """Append a record for each case and peer that has none; our own needs one of this revision.
+
+    again: also where there is one.
+    """
     interpreters = find_interpreters(peers, other)
     cases = make_cases(folder)
-    done = {key_of(r["case"], r["peer"], r["commit"]) for r in read_records()}
+    done = {key_of(r["case"], r["peer"], r["commit"]) for r in read_records() if not again}
     for case in cases:
         for name, python in interpreters.items():
             if key_of(case.name, name, commit()) in done:
@@ -256,10 +260,11 @@ def main() -> None:
     parser.add_argument("job", nargs="?", default="all", choices=["all", "run", "table"])
     parser.add_argument("--peers", nargs="+", default=list(PEERS), choices=list(PEERS))
     parser.add_argument("--python", help="a second interpreter, for the peers this one lacks")
+    parser.add_argument("--again", action="store_true", help="also what has a record: new times")
     parser.add_argument("--folder", type=Path, default=Path("/tmp/peers/pairs"))
     options = parser.parse_args()
     if options.job != "table":
-        run_all(options.folder, options.peers, options.python)
+        run_all(options.folder, options.peers, options.python, again=options.again)
     if options.job != "run":
         write_tables()
 
