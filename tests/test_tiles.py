@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import math
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,9 +39,11 @@ from commonmap.matching.tiles import (
     Tile,
     TilePlan,
     find_level,
+    find_turned_rim,
     plan_tiles,
     search_tile,
     search_tiles,
+    turn_columns,
 )
 from commonmap.types import no_progress
 
@@ -151,6 +155,15 @@ def test_peaks_of_tiles_are_the_peaks_of_the_whole_surface(seed: int, extent: in
         assert len(index) >= 3
         assert peaks[:, :2].tolist() == index.tolist()
         assert peaks[:, 2].tolist() == score[index[:, 0], index[:, 1]].tolist()
+
+
+@pytest.mark.parametrize("least", [1.0, 7.3, 60.0, 1e6])
+def test_the_rim_of_all_yaws_is_that_of_the_turned_sources(least: float) -> None:
+    sweep = replace(sweep_of(cut(BASE, slice(0, 26), slice(2, 15)), 0.5, 11), min_pairs=least)
+    masks = [turn_columns(sweep, yaw[None])[1][..., 0] > 0 for yaw in sweep.yaws]
+    expected = arrays.find_rim(masks, (sweep.side, sweep.side), max(1, math.ceil(least)))
+    assert find_turned_rim(sweep) == expected
+    assert (expected[0] == sweep.side) == (least == 1e6)
 
 
 def test_equal_peaks_of_two_tiles_keep_the_order_of_one_piece() -> None:

@@ -9,15 +9,14 @@ reaches (the decoy).
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import partial
 
+import numba
 import numpy as np
 
 from commonmap.config import ComputeConfig
 from commonmap.frames import from_xyz_yaw
-from commonmap.matching.arrays import find_rim
 from commonmap.matching.climb import HERE, climb_all, starts_around
 from commonmap.matching.evidence import count_tables, sum_table, weigh, xlogx_table
 from commonmap.matching.slabs import Columns, SlabGrid, coarsen, is_shared, list_columns
@@ -25,9 +24,9 @@ from commonmap.matching.tiles import (
     Level,
     Sweep,
     find_level,
+    find_turned_rim,
     plan_tiles,
     search_tiles,
-    turn_columns,
 )
 from commonmap.types import Float64s, Progress, no_progress
 
@@ -231,8 +230,7 @@ def _search_all(
     sweep = Sweep(columns, cell, low, side, yaws, min_pairs, compute.arrays)
     at_once = workers if compute.scheduler is None else 1
     # where the maps touch in so few rows that no pose there has pairs enough, nothing is scored
-    turned = (turn_columns(sweep, yaw[None])[1][..., 0] > 0 for yaw in yaws)
-    rim = find_rim(turned, (side, side), max(1, math.ceil(min_pairs)))
+    rim = find_turned_rim(sweep)
     shared = level.whole is not None and is_shared(level.whole.known, columns.n_slabs)
     shared = shared and is_shared(columns.known, columns.n_slabs)
     plan = plan_tiles(
@@ -261,14 +259,22 @@ def separate(
     """Return the indices of the best poses, best first, no two of them nearer than both limits."""
     order = np.argsort(-score, kind="stable")
     order = order[np.isfinite(score[order])]
-    kept: list[int] = []
+    return np.asarray(_separate(np.ascontiguousarray(pose), order, distance, yaw, n))
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _separate(pose, order, distance, yaw, most):  # type: ignore[no-untyped-def]
+    kept, n = np.empty(min(most, order.shape[0]), np.int64), 0
     for i in order:
-        if kept:
-            delta = pose[kept] - pose[i]
-            turn = np.abs((delta[:, 2] + np.pi) % (2.0 * np.pi) - np.pi)
-            if ((np.hypot(delta[:, 0], delta[:, 1]) < distance) & (turn < yaw)).any():
-                continue
-        kept.append(int(i))
-        if len(kept) == n:
+        if n == kept.shape[0]:
             break
-    return np.array(kept, dtype=np.int64)
+        alone = True
+        for k in kept[:n]:
+            turn = abs((pose[k, 2] - pose[i, 2] + np.pi) % (2.0 * np.pi) - np.pi)
+            if turn < yaw and np.hypot(pose[k, 0] - pose[i, 0], pose[k, 1] - pose[i, 1]) < distance:
+                alone = False
+                break
+        if alone:
+            kept[n] = i
+            n += 1
+    return kept[:n].copy()

@@ -9,6 +9,7 @@ of the tiles together are to the bit those of the whole in one piece.
 from __future__ import annotations
 
 import importlib
+import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -16,6 +17,7 @@ from functools import partial
 from itertools import islice, pairwise
 from typing import Any
 
+import numba
 import numpy as np
 
 from commonmap.config import ComputeConfig
@@ -280,6 +282,44 @@ def turn_columns(sweep: Sweep, yaws: Float64s) -> tuple[Bits, Bits]:
         sweep.low, sweep.side, sweep.side,
     )  # fmt: skip
     return occupied, known
+
+
+def find_turned_rim(sweep: Sweep) -> tuple[int, int]:
+    """Return how many rows and columns at each end hold too few known cells for a pose, at any yaw.
+
+    What `arrays.find_rim` says of the sources that `turn_columns` returns.
+    """
+    rows, columns = _find_turned_rim(
+        sweep.columns.xy, np.cos(sweep.yaws), np.sin(sweep.yaws), sweep.cell, sweep.low, sweep.side,
+        max(1, math.ceil(sweep.min_pairs)),
+    )  # fmt: skip
+    return rows, columns
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _find_turned_rim(xy, cosines, sines, cell, low, side, least):  # type: ignore[no-untyped-def]
+    last = np.full((side, side), -1, np.int32)  # the yaw at which a cell was met last
+    count = np.empty((2, side), np.int64)
+    rim = np.full(2, side, np.int64)
+    for w in range(cosines.shape[0]):
+        count[:] = 0
+        for n in range(xy.shape[0]):
+            i = int(np.floor((cosines[w] * xy[n, 0] - sines[w] * xy[n, 1] - low[0]) / cell))
+            j = int(np.floor((sines[w] * xy[n, 0] + cosines[w] * xy[n, 1] - low[1]) / cell))
+            if 0 <= i < side and 0 <= j < side and last[i, j] != w:
+                last[i, j] = w
+                count[0, i] += 1
+                count[1, j] += 1
+        for axis in range(2):
+            for step in (1, -1):
+                outermost, cells = 0, 0
+                while outermost < side:
+                    cells += count[axis, outermost if step > 0 else side - 1 - outermost]
+                    if cells >= least:
+                        break
+                    outermost += 1
+                rim[axis] = min(rim[axis], outermost)
+    return rim[0], rim[1]
 
 
 def _search_yaws(start: int, *, task: Task, spectra: Spectra) -> list[Float64s]:
