@@ -119,8 +119,13 @@ def _join(bits, factor, first_i, first_j, out):  # type: ignore[no-untyped-def]
     """Lay the bits over coarse cells; bits[0, 0] is the fine cell (first_i, first_j) of `out`."""
     for i in range(bits.shape[0]):
         row = out[(i + first_i) // factor]
-        for j in range(bits.shape[1]):
-            row[(j + first_j) // factor] |= bits[i, j]
+        j, k, end = 0, first_j // factor, factor - first_j % factor
+        while j < bits.shape[1]:
+            union = bits.dtype.type(0)
+            for fine in range(j, min(end, bits.shape[1])):
+                union |= bits[i, fine]
+            row[k] |= union
+            j, k, end = end, k + 1, end + factor
 
 
 def is_shared(known: Bits, n_slabs: int) -> bool:
