@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from commonmap.config import ComputeConfig
-from commonmap.matching.climb import HERE, climb_all, pack_planes, starts_around
+from commonmap.matching.climb import HERE, climb_all, starts_around
+from commonmap.matching.planes import pack_planes
 from commonmap.matching.search import evidence_at
 from commonmap.matching.slabs import Columns, SlabGrid, list_columns, pack_slabs
 from commonmap.matching.tiles import find_level

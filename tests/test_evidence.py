@@ -19,13 +19,13 @@ from commonmap.matching.evidence import (
     xlogx_table,
 )
 from commonmap.matching.evidence_fft import (
-    _bound_scores,
     evidence_peaks,
     evidence_surface,
     evidence_surfaces,
     plan_lanes,
     transform_target,
 )
+from commonmap.matching.evidence_kernels import bound_scores
 from commonmap.matching.peaks import local_maxima
 from commonmap.matching.search import evidence_at
 from commonmap.matching.slabs import (
@@ -288,12 +288,12 @@ def test_no_table_scores_more_than_its_bound(n: int) -> None:
         ]
     )
     tables = np.concatenate([tables, np.repeat(tables[-1:], -len(tables) % 8, axis=0)])
-    # two slabs with the same table: the counts as `_find_peaks` has them, in two complex products
+    # two slabs with the same table: the counts as `find_peaks` has them, in two complex products
     lanes = tables.T.reshape(4, -1, 8).astype(np.float32)
     row = np.stack([lanes[:2], lanes[2:]]).swapaxes(1, 2).reshape(2, -1)
     bound = np.empty(len(tables), np.float32)
     counts = np.array([[0, 1, 2, 3], [0, 1, 2, 3]])
-    _bound_scores(np.ascontiguousarray(row), counts, 0, len(tables) // 8, bound)
+    bound_scores(np.ascontiguousarray(row), counts, 0, len(tables) // 8, bound)
     xlogx = xlogx_table(n)
     score = np.array(
         [
