@@ -11,7 +11,7 @@ where both layers come from one lane Z = X_a + i X_b, of which `X_a = (Z(f) + co
 target's spectra alone. Eight yaws go side by side through every transform (`lane_fft.py`). Of the
 counts only those of one row of translations exist at a time; they are whole numbers, so rounding
 takes away what single precision adds, and the answer is the same to the bit whatever the size of
-the transforms, the number of yaws at a time, or the machine.
+the transforms or the number of yaws at a time.
 
 On a GPU the same counts come from CuPy's transforms, `evidence_device.py`.
 """

@@ -79,6 +79,8 @@ def count_planes(s_occupied, s_known, t_occupied, t_known, i0, j0, pad, counts):
                 s, t = a * n_words + w, (a + i0) * n_t + (bit >> 6)
                 if shared:
                     word = mine_k[s]
+                    if word == 0:
+                        continue
                     t_word = _window(other_k[t], other_k[t + 1], bit)
                     if (word & t_word) == 0:
                         continue
