@@ -9,7 +9,7 @@ import pytest
 
 from commonmap.config import ComputeConfig
 from commonmap.matching.climb import HERE, climb_all, starts_around
-from commonmap.matching.planes import pack_planes
+from commonmap.matching.planes import pack_planes, turn_planes
 from commonmap.matching.search import evidence_at
 from commonmap.matching.slabs import Columns, SlabGrid, list_columns, pack_slabs
 from commonmap.matching.tiles import find_level
@@ -164,6 +164,42 @@ def test_planes_by_hand() -> None:
     assert planes[0, :, 1].tolist() == [0, 1 << 63, 0, 0]
     assert planes[1, :, 0].tolist() == [0, 0, 1 << 5, 0]
     assert planes[1, :, 1].tolist() == [0, 0, 1, 0]
+
+
+@pytest.mark.parametrize("alone", [True, False])
+@pytest.mark.parametrize("side", [9, 75, 141])
+def test_half_cells_pair_up_in_four_ways(side: int, alone: bool) -> None:
+    rng = np.random.default_rng([side, alone])
+    n_slabs, n, n_words = 3, 30 * side, -(-side // 64)
+    xy = rng.uniform(-0.34 * side, 0.34 * side, (n, 2))
+    occupied = rng.integers(0, 1 << n_slabs, n).astype(np.uint32)
+    known = rng.integers(0, 1 << n_slabs, n).astype(np.uint32) | occupied
+    x, y, yaw = 0.3, 0.8, 0.7
+    rooms = [
+        np.empty((rows, words, planes), np.uint64)
+        for rows, words, planes in (
+            (2 * side, 2 * n_words, 8),
+            (2 * side, 2 * n_words, 1 if alone else 8),
+        )
+    ]
+    found = [np.empty((4, side, n_words, room.shape[2]), np.uint64) for room in rooms]
+    turn_planes(xy, occupied, known, n_slabs, yaw, 1.0, x, y, *rooms, *found)
+    # the slow twin: a set of half cells, then of cells
+    turned = xy @ np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+    half = np.floor(2.0 * turned + 2.0 * np.array([x, y])).astype(int) + side - 1
+    for a in range(2):
+        for b in range(2):
+            cell = (half + np.array([a, b])) // 2
+            for bits, planes in zip((occupied, known), found, strict=True):
+                expected = np.zeros((side, 64 * n_words, planes.shape[3]), bool)
+                for k in range(1 if planes.shape[3] == 1 else n_slabs):
+                    here = cell[(bits >> np.uint32(k)) & 1 == 1]
+                    expected[here[:, 0], here[:, 1], k] = True
+                words = np.packbits(
+                    expected.swapaxes(1, 2).reshape(side, -1, n_words, 64), axis=-1,
+                    bitorder="little",
+                ).view(np.uint64)[..., 0]  # fmt: skip
+                assert np.array_equal(planes[2 * a + b], words.swapaxes(1, 2))
 
 
 @pytest.mark.parametrize(
