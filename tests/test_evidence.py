@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from commonmap.matching import arrays
 from commonmap.matching.arrays import NUMPY
 from commonmap.matching.evidence import (
     count_tables,
@@ -323,6 +324,17 @@ def test_counts_share_complex_values() -> None:
     job = plan_lanes(five, five, False, False)
     assert len(job.parts) == 5 and len(job.products) == 10
     assert sorted(job.counts.ravel().tolist()) == list(range(20))
+
+
+def test_a_single_surface_leaves_nothing_borrowed() -> None:
+    grid = packed(*random_slabs(np.random.default_rng(9), 2, (30, 30), shared=True))
+    evidence_surfaces(
+        transform_target(grid, (30, 30)), grid.occupied[..., None], grid.known[..., None],
+        min_overlap=1.0,
+    )  # fmt: skip
+    assert any(role.startswith("evidence") for role in arrays._own.__dict__)
+    evidence_surface(transform_target(grid, (30, 30)), grid.occupied, grid.known, min_overlap=1.0)
+    assert not any(role.startswith("evidence") for role in arrays._own.__dict__)
 
 
 def test_nine_yaws_are_too_many() -> None:

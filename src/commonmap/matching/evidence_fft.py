@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from commonmap.matching import evidence_device
-from commonmap.matching.arrays import NUMPY, Array, Arrays, borrow
+from commonmap.matching.arrays import NUMPY, Array, Arrays, borrow, give_back
 from commonmap.matching.evidence import xlogx_table
 from commonmap.matching.evidence_kernels import (
     find_peaks,
@@ -173,7 +173,9 @@ def evidence_surface(
     score, overlap = evidence_surfaces(
         target, occupied[..., None], known[..., None], min_overlap=min_overlap
     )
-    return score[0].copy(), overlap[0].copy()
+    answer = score[0].copy(), overlap[0].copy()
+    give_back("evidence")
+    return answer
 
 
 def evidence_surfaces(
