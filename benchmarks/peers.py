@@ -168,8 +168,8 @@ def overall_table(peers: dict[str, list[Record]]) -> list[str]:
     """Return the lines of the table over all simulated pairs."""
     lines = [
         "| | found within " + " | ".join(WITHIN) + " | accepted and right | accepted, but wrong | "
-        "other places accepted | CPU s, median (most) | peak MB |",
-        "|---" * (len(WITHIN) + 6) + "|",
+        "other places accepted | CPU s, median (most) | CPU s a right answer | peak MB |",
+        "|---" * (len(WITHIN) + 7) + "|",
     ]
     for name, rows in peers.items():
         match = [r for r in rows if r["label"] == "match" and r["family"] != "real"]
@@ -182,6 +182,7 @@ def overall_table(peers: dict[str, list[Record]]) -> list[str]:
             str(sum(is_wrong(r) for r in match)),
             f"{sum(is_wrong(r) for r in other)} of {len(other)}",
             f"{statistics.median(timed):.1f} ({max(timed):.0f})" if timed else "-",
+            f"{sum(timed) / right:.1f}" if right else "-",
             f"{max(r.get('peak_mb', 0.0) for r in rows):.0f}",
         ]  # fmt: skip
         lines.append("| " + " | ".join(cells) + " |")
