@@ -260,3 +260,9 @@ def test_inliers_by_hand() -> None:
     assert share_of_inliers(target, stands, source, source[:, 2] > 0.25, away, reach=0.5) == 0.0
     half = from_xyz_yaw(-5.0, 0.0, 0.3, 0.0)  # the other post now, and a little higher
     assert share_of_inliers(target, stands, source, source[:, 2] > 0.25, half, reach=0.5) == 0.5
+
+
+def test_thinning_keeps_points_apart_however_wide_the_cloud() -> None:
+    far = np.array([[0.0] * 3, [4e4] * 3, [6e4] * 3])  # 8e18 voxels: more than can be numbered
+    thinned = thin(far, 0.03)
+    assert np.array_equal(thinned[np.argsort(thinned[:, 0])], far)

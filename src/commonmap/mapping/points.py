@@ -127,12 +127,10 @@ def first_of_voxels(xyz: Float64s, voxel: float) -> NDArray[np.int64]:
 
 def _group(xyz: Float64s, voxel: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the points' order by voxel, and where each voxel starts in it."""
-    xyz = np.ascontiguousarray(xyz)
-    low, high = (np.floor(end / voxel) for end in bounds(xyz))
+    xyz, scale = np.ascontiguousarray(xyz), 1.0 / voxel
+    low, high = (np.floor(end * scale) for end in bounds(xyz))
     shape = high - low + 1.0
-    if np.prod(shape) >= 2.0**62:
-        shape = np.full(3, 2.0**20)  # folded onto as many voxels as can be numbered
-    key = _voxel_keys(xyz, 1.0 / voxel, low, shape.astype(np.int64))
+    key = _voxel_keys(xyz, scale, low, shape.astype(np.int64))
     if np.prod(shape) < 2.0**31:
         key = key.astype(np.int32)  # half the bytes to sort
     order, key = _sort(key)
@@ -157,15 +155,16 @@ def _starts(key):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
 def _voxel_keys(xyz, scale, low, shape):  # type: ignore[no-untyped-def]
-    """Return one number per point, the same in a voxel, rising in x, then y, then z."""
+    """Return one number per point, the same in a voxel, rising in x, then y, then z.
+
+    Numbers beyond 2^62 are folded: only of voxels very far apart may some then share one.
+    """
     key = np.empty(xyz.shape[0], np.int64)
     for n in range(xyz.shape[0]):
         number = np.int64(0)
         for a in range(3):
-            cell = np.int64(np.floor(xyz[n, a] * scale) - low[a])
-            # rounding may leave a point of the rim one cell outside
-            number = number * shape[a] + min(max(cell, 0), shape[a] - 1)
-        key[n] = number
+            number = number * shape[a] + np.int64(np.floor(xyz[n, a] * scale) - low[a])
+        key[n] = number & np.int64((1 << 62) - 1)
     return key
 
 
