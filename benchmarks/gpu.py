@@ -36,7 +36,7 @@ from commonmap.matching.arrays import find_arrays
 from commonmap.matching.correlate import prepare_target, score_surface
 from commonmap.matching.evidence_fft import evidence_peaks, transform_target
 from commonmap.matching.search import search
-from commonmap.matching.slabs import pack_slabs
+from commonmap.matching.slabs import SlabGrid, pack_slabs
 
 RECORD = Path(__file__).parent / "records" / "gpu.json"
 SIDE = 44
@@ -98,9 +98,8 @@ def divergence_job(arrays: str, n_cells: int, n_yaws: int) -> tuple[float, Any]:
     return (time.perf_counter() - start) / n_yaws, surface.score
 
 
-def search_job(arrays: str, side: float, folder: Path) -> tuple[float, str]:
+def search_job(arrays: str, base: SlabGrid, draft: SlabGrid) -> tuple[float, str]:
     """Return (seconds, digest of the answer) of a whole search."""
-    base, draft = make_base(side, folder), make_draft()
     compute = ComputeConfig(arrays=arrays, memory_gb=2.0)  # type: ignore[arg-type]
     search(base, draft, min_overlap=0.1, workers=2, compute=compute)
     start = time.perf_counter()
@@ -125,8 +124,9 @@ def measure(side: float, n_yaws: int) -> dict[str, Any]:
         raise SystemExit(f"k, {side:g} m: the GPU's scores are off by {off:g}")
     record["k_s_a_yaw"] = {"cpu 1 thread": one, "gpu": device, "off": off}
     with tempfile.TemporaryDirectory() as name:
-        two, expected = search_job("numpy", side, Path(name))
-        device, found = search_job("cupy", side, Path(name))
+        base, draft = make_base(side, Path(name)), make_draft()
+        two, expected = search_job("numpy", base, draft)
+        device, found = search_job("cupy", base, draft)
     if found != expected:
         raise SystemExit(f"search, {side:g} m: the GPU's answer is another")
     record["search_s"] = {"cpu 2 threads": two, "gpu": device}

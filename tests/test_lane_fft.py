@@ -98,7 +98,7 @@ def test_eight_sequences_transform_as_each_by_itself(n: int, dtype: Any) -> None
     for sign, expected in ((1, np.fft.fft(z, axis=0)), (-1, np.fft.ifft(z, axis=0) * n)):
         a = np.stack([z.real, z.imag], axis=1).astype(dtype).ravel()
         b = np.empty_like(a)
-        swapped = transform_line(a, b, n, plan.radices, plan.roots, plan.angles, dtype(sign))
+        swapped = transform_line(a, b, plan, dtype(sign))
         assert swapped == (len(plan.radices) % 2 == 1)
         found = (b if swapped else a).reshape(n, 2, WIDTH)
         assert a.size == n * STEP
@@ -138,8 +138,8 @@ def test_columns_transform_as_numpy_has_it(n_in: int, width: int, dtype: Any) ->
         (-1, 1 / 24, np.fft.ifft(z, n=24, axis=0)),
     ):
         transform_columns(
-            z.view(dtype).ravel(), out.view(dtype).reshape(-1), n_in, width, 24, plan.radices,
-            plan.roots, plan.angles, dtype(sign), dtype(scale),
+            z.view(dtype).ravel(), out.view(dtype).reshape(-1), n_in, width, plan,
+            dtype(sign), dtype(scale),
         )  # fmt: skip
         assert np.abs(out - expected).max() < 8.0 * np.finfo(dtype).eps * np.abs(expected).max()
 

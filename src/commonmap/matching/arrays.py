@@ -171,8 +171,8 @@ def _transform_first_axis(values: Array, out: Array, sign: int) -> None:
     n, width = out.shape
     plan = plan_transform(n, number)
     transform_columns(
-        values.view(number).reshape(-1), out.view(number).reshape(-1), len(values), width, n,
-        plan.radices, plan.roots, plan.angles, number(sign), number(1.0 if sign > 0 else 1.0 / n),
+        values.view(number).reshape(-1), out.view(number).reshape(-1), len(values), width,
+        plan, number(sign), number(1.0 if sign > 0 else 1.0 / n),
     )  # fmt: skip
 
 

@@ -21,6 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import zip_longest
 from typing import Any
 
@@ -77,7 +78,7 @@ class Spectra:
 
     def known_layer(self, slab: int) -> int:
         """Return which of the layers tells what is known in a slab."""
-        return self.n_slabs + (0 if self.shared_known else slab)
+        return _known_layer(self.n_slabs, self.shared_known, slab)
 
     @property
     def at_once(self) -> int:
@@ -85,6 +86,10 @@ class Spectra:
         if self.arrays.name == "numpy":
             return WIDTH
         return min(max((1 << 25) // (self.fft_shape[0] * self.fft_shape[1]), 1), 64)
+
+
+def _known_layer(n_slabs: int, shared: bool, slab: int) -> int:
+    return n_slabs + (0 if shared else slab)
 
 
 def transform_target(
@@ -179,7 +184,7 @@ def evidence_surface(
 
 
 def evidence_surfaces(
-    target: Spectra, occupied: Bits, known: Bits, *, min_overlap: float, count: bool = True
+    target: Spectra, occupied: Bits, known: Bits, *, min_overlap: float
 ) -> tuple[Float32s, Float32s]:
     """Return (score, overlap), (n_yaws, U, V) each, at every translation of turned sources.
 
@@ -187,8 +192,8 @@ def evidence_surfaces(
     translations, (tx + sx - 1, ty + sy - 1), the answers hold those of `target.rows` and
     `target.columns`. Translation [u, v] lays source cell [i, j] on target cell
     [i + u - (sx - 1), j + v - (sy - 1)]. Poses with fewer than `min_overlap` known pairs in the
-    best known slab score -inf. overlap: known pairs, the largest over the slabs; empty unless
-    `count`. The answers are borrowed (`arrays.borrow`): they last until this thread's next call.
+    best known slab score -inf. overlap: known pairs, the largest over the slabs. The answers are
+    borrowed (`arrays.borrow`): they last until this thread's next call.
     """
     least, table = math.ceil(min_overlap), xlogx_table(occupied.shape[0] * occupied.shape[1])
     if target.arrays.name != "numpy":
@@ -197,11 +202,10 @@ def evidence_surfaces(
         return evidence_device.score(target, occupied, known, shared, standing, least, table)
     products, job = _correlate(target, occupied, known)
     score = borrow(NUMPY, "evidence score", (occupied.shape[2], *target.shape), np.float32)
-    overlap = borrow(NUMPY, "evidence overlap", score.shape if count else (0, 0, 0), np.float32)
-    y = target.plans[1]
+    overlap = borrow(NUMPY, "evidence overlap", score.shape, np.float32)
     score_rows(
-        products, job.counts, job.overlaps, target.columns[0], least, table, y.radices, y.roots,
-        y.angles, score, overlap,
+        products, job.counts, job.overlaps, target.columns[0], least, table, target.plans[1], score,
+        overlap,
     )  # fmt: skip
     return score, overlap
 
@@ -226,10 +230,9 @@ def evidence_peaks(
     own = (low_u, n_u - high_u, low_v, n_v - high_v)
     least, table = math.ceil(min_overlap), xlogx_table(occupied.shape[0] * occupied.shape[1])
     products, job = _correlate(target, occupied, known)
-    y = target.plans[1]
     index, value = find_peaks(
         products, job.counts, job.overlaps, occupied.shape[2], (target.columns[0], n_v), own, least,
-        n_peaks, table, y.radices, y.roots, y.angles,
+        n_peaks, table, target.plans[1],
     )  # fmt: skip
     return [_list_peaks(*found) for found in zip(index, value, strict=True)]
 
@@ -257,9 +260,10 @@ def _correlate(target: Spectra, occupied: Bits, known: Bits) -> tuple[Any, Lanes
             ("products", (target.shape[0], len(job.products), n_y * STEP)),
         )
     )
-    x, y = ((plan.radices, plan.roots, plan.angles) for plan in target.plans)
-    transform_sources(occupied, known, job.parts, *x, *y, rows, lanes)
-    multiply_and_invert(lanes, target.layers, job.products, target.rows[0], *x, products)
+    transform_sources(occupied, known, job.parts, *target.plans, rows, lanes)
+    multiply_and_invert(
+        lanes, target.layers, job.products, target.rows[0], target.plans[0], products
+    )
     return products, job
 
 
@@ -297,9 +301,7 @@ def plan_lanes(
     parts.reshape(-1)[: len(sources)] = sources
     place = {source: divmod(n, 2) for n, source in enumerate(sources)}
 
-    def known_layer(k: int) -> int:
-        return n_slabs + (0 if target_shared else k)
-
+    known_layer = partial(_known_layer, n_slabs, target_shared)
     # every count is a layer of the source on one of the target
     wanted = [(2 * k + 1, known_layer(k)) for k in seen]
     for k in slabs:

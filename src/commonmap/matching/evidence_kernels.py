@@ -18,7 +18,7 @@ from commonmap.metrics.formulas import DOUBT
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
 def transform_sources(  # type: ignore[no-untyped-def]
-    occupied, known, parts, radices_x, roots_x, angles_x, radices_y, roots_y, angles_y, rows, out
+    occupied, known, parts, plan_x, plan_y, rows, out
 ):
     """Set out (n_lanes, Ny, Nx * STEP) to the spectra of the source's lanes.
 
@@ -43,7 +43,7 @@ def transform_sources(  # type: ignore[no-untyped-def]
                     at = (side_y - 1 - j) * STEP + part * WIDTH
                     for w in range(n_yaws):
                         a[at + w] = (bits[i, j, w] >> slab) & 1
-            line = b if transform_line(a, b, n_y, radices_y, roots_y, angles_y, forward) else a
+            line = b if transform_line(a, b, plan_y, forward) else a
             place = (side_x - 1 - i) * STEP
             for f in range(n_y):
                 for h in (0, WIDTH):
@@ -51,13 +51,13 @@ def transform_sources(  # type: ignore[no-untyped-def]
         for f in range(n_y):
             a[: side_x * STEP] = rows[f]
             a[side_x * STEP : n_x * STEP] = 0
-            line = b if transform_line(a, b, n_x, radices_x, roots_x, angles_x, forward) else a
+            line = b if transform_line(a, b, plan_x, forward) else a
             out[lane, f] = line[: n_x * STEP]
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})  # type: ignore[misc]
 def multiply_and_invert(  # type: ignore[no-untyped-def]
-    lanes, layers, products, first_row, radices_x, roots_x, angles_x, out
+    lanes, layers, products, first_row, plan_x, out
 ):
     """Set out (n_rows, n_products, Ny * STEP) to the products, back from frequencies along x."""
     n_y, n_x = lanes.shape[1], lanes.shape[2] // STEP
@@ -93,7 +93,7 @@ def multiply_and_invert(  # type: ignore[no-untyped-def]
                 yr, yi = load(turned, there), load(turned, there + WIDTH)
                 store(a, at, pr * zr - pi * zi + qr * yr + qi * yi)
                 store(a, at + WIDTH, pr * zi + pi * zr + qi * yr - qr * yi)
-            line = b if transform_line(a, b, n_x, radices_x, roots_x, angles_x, back) else a
+            line = b if transform_line(a, b, plan_x, back) else a
             for u in range(out.shape[0]):
                 row = out[u, m]
                 at = (first_row + u) * STEP
@@ -102,12 +102,12 @@ def multiply_and_invert(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
-def _invert_row(products, u, radices_y, roots_y, angles_y, spare, row):  # type: ignore[no-untyped-def]
+def _invert_row(products, u, plan_y, spare, row):  # type: ignore[no-untyped-def]
     """Set row (n_products, Ny * STEP) to the counts of one row of translations, not yet rounded."""
-    n_y, back = spare.shape[0] // STEP, products.dtype.type(-1)
+    back = products.dtype.type(-1)
     for m in range(row.shape[0]):
         a = products[u, m]
-        row[m] = spare if transform_line(a, spare, n_y, radices_y, roots_y, angles_y, back) else a
+        row[m] = spare if transform_line(a, spare, plan_y, back) else a
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
@@ -141,28 +141,25 @@ def _score_at(row, counts, at, xlogx):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
 def score_rows(  # type: ignore[no-untyped-def]
-    products, counts, overlaps, first_column, least, xlogx, radices_y, roots_y, angles_y, score,
-    overlap
-):  # fmt: skip
-    """Set the scores (n_yaws, n_rows, n_columns), and the overlaps if there is room for them."""
+    products, counts, overlaps, first_column, least, xlogx, plan_y, score, overlap
+):
+    """Set the scores and the overlaps, (n_yaws, n_rows, n_columns) each."""
     n_y = products.shape[2]
     spare, row = np.empty(n_y, products.dtype), np.empty((products.shape[1], n_y), products.dtype)
     for u in range(score.shape[1]):
-        _invert_row(products, u, radices_y, roots_y, angles_y, spare, row)
+        _invert_row(products, u, plan_y, spare, row)
         for v in range(score.shape[2]):
             for w in range(score.shape[0]):
                 at = (first_column + v) * STEP + w
                 seen = _count_overlap(row, overlaps, at)
-                if overlap.shape[0] > 0:
-                    overlap[w, u, v] = seen
+                overlap[w, u, v] = seen
                 score[w, u, v] = _score_at(row, counts, at, xlogx) if seen >= least else -np.inf
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
 def find_peaks(  # type: ignore[no-untyped-def]
-    products, counts, overlaps, n_yaws, columns, own, least, n_peaks, xlogx, radices_y, roots_y,
-    angles_y
-):  # fmt: skip
+    products, counts, overlaps, n_yaws, columns, own, least, n_peaks, xlogx, plan_y
+):
     """Return (n_yaws, n_peaks, 2) indices and values of the best peaks of each yaw.
 
     columns: the first one and how many. own: first and behind the last row, then column, that may
@@ -178,7 +175,7 @@ def find_peaks(  # type: ignore[no-untyped-def]
     for u in range(n_rows + 1):
         score[:, u % 3] = -np.inf
         if u < n_rows:
-            _invert_row(products, u, radices_y, roots_y, angles_y, spare, row)
+            _invert_row(products, u, plan_y, spare, row)
             bound_scores(row, counts, first, n_columns, bound)
             for v in range(n_columns):
                 for w in range(n_yaws):

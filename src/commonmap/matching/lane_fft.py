@@ -8,9 +8,8 @@ them, real parts first: a sequence of n is a flat array of n * STEP numbers.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -25,8 +24,7 @@ STEP = 2 * WIDTH
 _compiled: Any = numba.njit(cache=True, nogil=True, fastmath={"contract"})
 
 
-@dataclass(frozen=True, eq=False)
-class Plan:
+class Plan(NamedTuple):
     """How sequences of length n are transformed.
 
     radices: their product is n. roots: (2, m) the factors e^(-2 pi i p k / n) of each pass in the
@@ -71,14 +69,15 @@ def plan_transform(n: int, dtype: type[np.floating[Any]]) -> Plan:
 
 
 @_compiled  # type: ignore[misc]
-def transform_line(a, b, n, radices, roots, angles, sign):  # type: ignore[no-untyped-def]
-    """Transform n complex values in `a`; return whether the answer lies in `b`, not in `a`.
+def transform_line(a, b, plan, sign):  # type: ignore[no-untyped-def]
+    """Transform plan.n complex values in `a`; return whether the answer lies in `b`, not in `a`.
 
     a, b: flat, n * STEP or longer; both are overwritten. sign: 1 forward, -1 back, not scaled, of
     the arrays' type.
     """
-    size, stride, first, swapped = n, 1, 0, False
-    for radix in radices:
+    roots, angles = plan.roots, plan.angles
+    size, stride, first, swapped = plan.n, 1, 0, False
+    for radix in plan.radices:
         x, y = (b, a) if swapped else (a, b)
         if radix == 4:
             _pass_4(x, y, size, stride, roots, first, sign)
@@ -96,12 +95,13 @@ def transform_line(a, b, n, radices, roots, angles, sign):  # type: ignore[no-un
 
 
 @_compiled  # type: ignore[misc]
-def transform_columns(x, y, n_in, width, n, radices, roots, angles, sign, scale):  # type: ignore[no-untyped-def]
-    """Transform along the first axis of (n_in, width) complex values, filled up with zeros to n.
+def transform_columns(x, y, n_in, width, plan, sign, scale):  # type: ignore[no-untyped-def]
+    """Transform along the first axis of (n_in, width) complex values, zeros up to n = plan.n.
 
     x, y: flat, real and imaginary parts in turn, the values and the answer (n, width); they may be
     the same. scale: the answer is multiplied by it, of the arrays' type as the sign.
     """
+    n = plan.n
     a, b = np.empty(n * STEP, y.dtype), np.empty(n * STEP, y.dtype)
     for start in range(0, width, WIDTH):
         rest = min(WIDTH, width - start)
@@ -111,17 +111,16 @@ def transform_columns(x, y, n_in, width, n, radices, roots, angles, sign, scale)
             at = 2 * (i * width + start)
             if rest == WIDTH:
                 real, imaginary = load_pairs(x, at)
-                store(a, i * STEP, real)
-                store(a, i * STEP + WIDTH, imaginary)
+                _store(a, i * STEP, real, imaginary)
             else:
                 for w in range(rest):
                     a[i * STEP + w], a[i * STEP + WIDTH + w] = x[at + 2 * w], x[at + 2 * w + 1]
         a[n_in * STEP :] = 0
-        line = b if transform_line(a, b, n, radices, roots, angles, sign) else a
+        line = b if transform_line(a, b, plan, sign) else a
         for i in range(n):
             at = 2 * (i * width + start)
             if rest == WIDTH:
-                real, imaginary = load(line, i * STEP), load(line, i * STEP + WIDTH)
+                real, imaginary = _load(line, i * STEP)
                 store_pairs(y, at, scale * real, scale * imaginary)
             else:
                 for w in range(rest):
@@ -130,25 +129,41 @@ def transform_columns(x, y, n_in, width, n, radices, roots, angles, sign, scale)
 
 
 @_compiled  # type: ignore[misc]
+def _root(roots, at, sign):  # type: ignore[no-untyped-def]
+    """Return the real and the imaginary part of a root, conjugated on the way back."""
+    return roots[0, at], sign * roots[1, at]
+
+
+@_compiled  # type: ignore[misc]
+def _load(x, at):  # type: ignore[no-untyped-def]
+    """Return the real and the imaginary lanes of a complex value."""
+    return load(x, at), load(x, at + WIDTH)
+
+
+@_compiled  # type: ignore[misc]
+def _store(y, at, real, imaginary):  # type: ignore[no-untyped-def]
+    store(y, at, real)
+    store(y, at + WIDTH, imaginary)
+
+
+@_compiled  # type: ignore[misc]
 def _turn_and_store(y, at, root_r, root_i, real, imaginary):  # type: ignore[no-untyped-def]
     """Store the complex value times the root."""
-    store(y, at, root_r * real - root_i * imaginary)
-    store(y, at + WIDTH, root_r * imaginary + root_i * real)
+    _store(y, at, root_r * real - root_i * imaginary, root_r * imaginary + root_i * real)
 
 
 @_compiled  # type: ignore[misc]
 def _pass_2(x, y, size, stride, roots, first, sign):  # type: ignore[no-untyped-def]
     m, apart = size // 2, stride * STEP
     for p in range(m):
-        wr, wi = roots[0, first + p], sign * roots[1, first + p]
+        wr, wi = _root(roots, first + p, sign)
         for q in range(stride):
             i = (q + stride * p) * STEP
             j = i + m * apart
             o = (q + stride * 2 * p) * STEP
-            ar, ai = load(x, i), load(x, i + WIDTH)
-            br, bi = load(x, j), load(x, j + WIDTH)
-            store(y, o, ar + br)
-            store(y, o + WIDTH, ai + bi)
+            ar, ai = _load(x, i)
+            br, bi = _load(x, j)
+            _store(y, o, ar + br, ai + bi)
             _turn_and_store(y, o + apart, wr, wi, ar - br, ai - bi)
 
 
@@ -158,25 +173,19 @@ def _pass_3(x, y, size, stride, roots, first, angles, sign):  # type: ignore[no-
     half, height = angles[0], sign * angles[1]
     for p in range(m):
         t = first + 2 * p
-        w1r, w1i, w2r, w2i = (
-            roots[0, t],
-            sign * roots[1, t],
-            roots[0, t + 1],
-            sign * roots[1, t + 1],
-        )
+        (w1r, w1i), (w2r, w2i) = _root(roots, t, sign), _root(roots, t + 1, sign)
         for q in range(stride):
             i = (q + stride * p) * STEP
             j = i + m * apart
             k = j + m * apart
             o = (q + stride * 3 * p) * STEP
-            ar, ai = load(x, i), load(x, i + WIDTH)
-            br, bi = load(x, j), load(x, j + WIDTH)
-            cr, ci = load(x, k), load(x, k + WIDTH)
+            ar, ai = _load(x, i)
+            br, bi = _load(x, j)
+            cr, ci = _load(x, k)
             sr, si = br + cr, bi + ci
             dr, di = height * (bi - ci), height * (cr - br)
             er, ei = ar - half * sr, ai - half * si
-            store(y, o, ar + sr)
-            store(y, o + WIDTH, ai + si)
+            _store(y, o, ar + sr, ai + si)
             _turn_and_store(y, o + apart, w1r, w1i, er + dr, ei + di)
             _turn_and_store(y, o + 2 * apart, w2r, w2i, er - dr, ei - di)
 
@@ -186,27 +195,21 @@ def _pass_4(x, y, size, stride, roots, first, sign):  # type: ignore[no-untyped-
     m, apart = size // 4, stride * STEP
     for p in range(m):
         t = first + 3 * p
-        w1r, w1i, w2r, w2i = (
-            roots[0, t],
-            sign * roots[1, t],
-            roots[0, t + 1],
-            sign * roots[1, t + 1],
-        )
-        w3r, w3i = roots[0, t + 2], sign * roots[1, t + 2]
+        (w1r, w1i), (w2r, w2i) = _root(roots, t, sign), _root(roots, t + 1, sign)
+        w3r, w3i = _root(roots, t + 2, sign)
         for q in range(stride):
             i = (q + stride * p) * STEP
             j = i + m * apart
             k = j + m * apart
             n = k + m * apart
             o = (q + stride * 4 * p) * STEP
-            ar, ai = load(x, i), load(x, i + WIDTH)
-            br, bi = load(x, j), load(x, j + WIDTH)
-            cr, ci = load(x, k), load(x, k + WIDTH)
-            dr, di = load(x, n), load(x, n + WIDTH)
+            ar, ai = _load(x, i)
+            br, bi = _load(x, j)
+            cr, ci = _load(x, k)
+            dr, di = _load(x, n)
             acr, aci, bdr, bdi = ar + cr, ai + ci, br + dr, bi + di
             er, ei, fr, fi = ar - cr, ai - ci, sign * (bi - di), sign * (dr - br)
-            store(y, o, acr + bdr)
-            store(y, o + WIDTH, aci + bdi)
+            _store(y, o, acr + bdr, aci + bdi)
             _turn_and_store(y, o + apart, w1r, w1i, er + fr, ei + fi)
             _turn_and_store(y, o + 2 * apart, w2r, w2i, acr - bdr, aci - bdi)
             _turn_and_store(y, o + 3 * apart, w3r, w3i, er - fr, ei - fi)
@@ -218,14 +221,9 @@ def _pass_5(x, y, size, stride, roots, first, angles, sign):  # type: ignore[no-
     c1, c2, s1, s2 = angles[2], angles[3], sign * angles[4], sign * angles[5]
     for p in range(m):
         t = first + 4 * p
-        w1r, w1i, w2r, w2i = (
-            roots[0, t],
-            sign * roots[1, t],
-            roots[0, t + 1],
-            sign * roots[1, t + 1],
-        )
-        w3r, w3i = roots[0, t + 2], sign * roots[1, t + 2]
-        w4r, w4i = roots[0, t + 3], sign * roots[1, t + 3]
+        (w1r, w1i), (w2r, w2i) = _root(roots, t, sign), _root(roots, t + 1, sign)
+        w3r, w3i = _root(roots, t + 2, sign)
+        w4r, w4i = _root(roots, t + 3, sign)
         for q in range(stride):
             i = (q + stride * p) * STEP
             j = i + m * apart
@@ -233,16 +231,15 @@ def _pass_5(x, y, size, stride, roots, first, angles, sign):  # type: ignore[no-
             n = k + m * apart
             h = n + m * apart
             o = (q + stride * 5 * p) * STEP
-            ar, ai = load(x, i), load(x, i + WIDTH)
-            br, bi = load(x, j), load(x, j + WIDTH)
-            cr, ci = load(x, k), load(x, k + WIDTH)
-            dr, di = load(x, n), load(x, n + WIDTH)
-            er, ei = load(x, h), load(x, h + WIDTH)
+            ar, ai = _load(x, i)
+            br, bi = _load(x, j)
+            cr, ci = _load(x, k)
+            dr, di = _load(x, n)
+            er, ei = _load(x, h)
             # the outer and the inner two of the four, their sums and differences
             ur, ui, vr, vi = br + er, bi + ei, br - er, bi - ei
             fr, fi, gr, gi = cr + dr, ci + di, cr - dr, ci - di
-            store(y, o, ar + ur + fr)
-            store(y, o + WIDTH, ai + ui + fi)
+            _store(y, o, ar + ur + fr, ai + ui + fi)
             pr, pi = ar + c1 * ur + c2 * fr, ai + c1 * ui + c2 * fi
             qr, qi = s1 * vi + s2 * gi, s1 * vr + s2 * gr
             _turn_and_store(y, o + apart, w1r, w1i, pr + qr, pi - qi)

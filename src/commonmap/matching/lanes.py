@@ -44,11 +44,15 @@ def _compiled(build: Any) -> Any:
     return intrinsic(build)
 
 
-def _place(context: Any, builder: Any, array: tuple[Any, Any], index: Any, vector: Any) -> Any:
-    """Return the pointer to the lanes that begin at an index of a contiguous array."""
-    kind, value = array
-    data = context.make_array(kind)(context, builder, value).data
-    return builder.bitcast(builder.gep(data, [index]), vector.as_pointer())
+def _place(context: Any, builder: Any, signature: Any, args: Any, vector: Any) -> Any:
+    """Return the pointer to a vector of the array args[0] that begins at the index args[1]."""
+    data = context.make_array(signature.args[0])(context, builder, args[0]).data
+    return builder.bitcast(builder.gep(data, [args[1]]), vector.as_pointer())
+
+
+def _align(signature: Any) -> int:
+    """Return by how many bytes a vector of that array is aligned at least: by those of a number."""
+    return int(signature.args[0].dtype.bitwidth // 8)
 
 
 @_compiled
@@ -57,10 +61,8 @@ def load(typing: Any, array: Any, index: Any) -> Any:
 
     def write(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         vector = context.get_value_type(signature.return_type)
-        found = builder.load(
-            _place(context, builder, (signature.args[0], args[0]), args[1], vector)
-        )
-        found.align = signature.args[0].dtype.bitwidth // 8
+        found = builder.load(_place(context, builder, signature, args, vector))
+        found.align = _align(signature)
         return found
 
     return Lanes(array.dtype)(array, types.intp), write
@@ -72,8 +74,8 @@ def store(typing: Any, array: Any, index: Any, lanes: Any) -> Any:
 
     def write(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         vector = context.get_value_type(signature.args[2])
-        there = _place(context, builder, (signature.args[0], args[0]), args[1], vector)
-        builder.store(args[2], there).align = signature.args[0].dtype.bitwidth // 8
+        there = _place(context, builder, signature, args, vector)
+        builder.store(args[2], there).align = _align(signature)
         return context.get_dummy_value()
 
     return types.void(array, types.intp, lanes), write
@@ -86,9 +88,8 @@ def load_pairs(typing: Any, array: Any, index: Any) -> Any:
 
     def write(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         wide = ir.VectorType(context.get_value_type(lanes).element, 2 * WIDTH)
-        array, index = (signature.args[0], args[0]), args[1]
-        found = builder.load(_place(context, builder, array, index, wide))
-        found.align = array[0].dtype.bitwidth // 8
+        found = builder.load(_place(context, builder, signature, args, wide))
+        found.align = _align(signature)
         halves = [_shuffle(builder, found, found, range(first, 2 * WIDTH, 2)) for first in (0, 1)]
         return context.make_tuple(builder, signature.return_type, halves)
 
@@ -101,10 +102,10 @@ def store_pairs(typing: Any, array: Any, index: Any, even: Any, odd: Any) -> Any
 
     def write(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         wide = ir.VectorType(context.get_value_type(signature.args[2]).element, 2 * WIDTH)
-        there = _place(context, builder, (signature.args[0], args[0]), args[1], wide)
+        there = _place(context, builder, signature, args, wide)
         order = [k // 2 + k % 2 * WIDTH for k in range(2 * WIDTH)]
         both = _shuffle(builder, args[2], args[3], order)
-        builder.store(both, there).align = signature.args[0].dtype.bitwidth // 8
+        builder.store(both, there).align = _align(signature)
         return context.get_dummy_value()
 
     return types.void(array, types.intp, even, odd), write

@@ -16,6 +16,7 @@ from commonmap.matching import correlate
 from commonmap.matching.arrays import find_rim
 from commonmap.matching.peaks import local_maxima
 from commonmap.matching.search import Peaks, count_yaws, separate
+from commonmap.matching.slabs import turned_cell
 from commonmap.matching.tiles import N_PEAKS
 from commonmap.metrics.plans import DifferenceSum, JointHistogram, MinSum, Smooth
 from commonmap.metrics.table import find_metric
@@ -151,8 +152,7 @@ def scatter_heights(xy, height, cosine, sine, cell, low, n_x, n_y):  # type: ign
     out = np.zeros((n_x, n_y))
     known = np.zeros((n_x, n_y), np.bool_)
     for n in range(xy.shape[0]):
-        i = int(np.floor((cosine * xy[n, 0] - sine * xy[n, 1] - low[0]) / cell))
-        j = int(np.floor((sine * xy[n, 0] + cosine * xy[n, 1] - low[1]) / cell))
+        i, j = turned_cell(xy[n, 0], xy[n, 1], cosine, sine, cell, low)
         if 0 <= i < n_x and 0 <= j < n_y:
             if not known[i, j] or height[n] > out[i, j]:
                 out[i, j] = height[n]

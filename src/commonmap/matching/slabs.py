@@ -162,17 +162,10 @@ def list_columns(grid: SlabGrid) -> Columns:
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
-def scatter(xy, occupied, known, cosine, sine, cell, low, n_x, n_y):  # type: ignore[no-untyped-def]
-    """Return the bits of columns turned by an angle, on a grid with lower corner `low`."""
-    out_occupied = np.zeros((n_x, n_y), np.uint32)
-    out_known = np.zeros((n_x, n_y), np.uint32)
-    for n in range(xy.shape[0]):
-        i = int(np.floor((cosine * xy[n, 0] - sine * xy[n, 1] - low[0]) / cell))
-        j = int(np.floor((sine * xy[n, 0] + cosine * xy[n, 1] - low[1]) / cell))
-        if 0 <= i < n_x and 0 <= j < n_y:
-            out_occupied[i, j] |= occupied[n]
-            out_known[i, j] |= known[n]
-    return out_occupied, out_known
+def turned_cell(x, y, cosine, sine, cell, low):  # type: ignore[no-untyped-def]
+    """Return the cell (i, j), on a grid with lower corner `low`, of a point that is turned."""
+    i = int(np.floor((cosine * x - sine * y - low[0]) / cell))
+    return i, int(np.floor((sine * x + cosine * y - low[1]) / cell))
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
@@ -183,12 +176,20 @@ def scatter_turns(xy, occupied, known, cosines, sines, cell, low, n_x, n_y):  # 
     out_known = np.zeros((n_x, n_y, n_turns), np.uint32)
     for n in range(xy.shape[0]):
         for w in range(n_turns):
-            i = int(np.floor((cosines[w] * xy[n, 0] - sines[w] * xy[n, 1] - low[0]) / cell))
-            j = int(np.floor((sines[w] * xy[n, 0] + cosines[w] * xy[n, 1] - low[1]) / cell))
+            i, j = turned_cell(xy[n, 0], xy[n, 1], cosines[w], sines[w], cell, low)
             if 0 <= i < n_x and 0 <= j < n_y:
                 out_occupied[i, j, w] |= occupied[n]
                 out_known[i, j, w] |= known[n]
     return out_occupied, out_known
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def scatter(xy, occupied, known, cosine, sine, cell, low, n_x, n_y):  # type: ignore[no-untyped-def]
+    """Return the bits of columns turned by an angle, on a grid with lower corner `low`."""
+    out_occupied, out_known = scatter_turns(
+        xy, occupied, known, np.array([cosine]), np.array([sine]), cell, low, n_x, n_y
+    )
+    return out_occupied[:, :, 0], out_known[:, :, 0]
 
 
 def unpack(arrays: Arrays, bits: Array, slab: int, dtype: Any) -> Array:

@@ -40,6 +40,7 @@ from commonmap.matching.slabs import (
     coarse_window,
     coarsen,
     scatter_turns,
+    turned_cell,
 )
 from commonmap.types import Float64s, Progress
 
@@ -304,8 +305,7 @@ def _find_turned_rim(xy, cosines, sines, cell, low, side, least):  # type: ignor
     for w in range(cosines.shape[0]):
         count[:] = 0
         for n in range(xy.shape[0]):
-            i = int(np.floor((cosines[w] * xy[n, 0] - sines[w] * xy[n, 1] - low[0]) / cell))
-            j = int(np.floor((sines[w] * xy[n, 0] + cosines[w] * xy[n, 1] - low[1]) / cell))
+            i, j = turned_cell(xy[n, 0], xy[n, 1], cosines[w], sines[w], cell, low)
             if 0 <= i < side and 0 <= j < side and last[i, j] != w:
                 last[i, j] = w
                 count[0, i] += 1
