@@ -24,7 +24,7 @@ MAX_SLOPE = math.tan(math.radians(38.0))
 """Steepest ground that is believed: 30 degrees, and what roughness adds over one cell."""
 
 
-PLANE_CELLS = 20_000
+PLANE_CELLS = 5_000
 """Cells that the plane under a map is fitted to."""
 
 

@@ -43,7 +43,7 @@ def choose_cell(target_xyz: Float64s, source_xyz: Float64s) -> float:
 
 def robust_extent(xyz: Float64s) -> float:
     """Return the wider side in metres of the box that holds the middle 98 % of the points."""
-    low, high = np.quantile(sample(xyz, 200_000)[:, :2], [0.01, 0.99], axis=0)
+    low, high = np.quantile(sample(xyz, 50_000)[:, :2], [0.01, 0.99], axis=0)
     return float((high - low).max())
 
 

@@ -26,7 +26,7 @@ MAX_SIGMA = math.radians(2.0)
 FINEST_STEP = math.radians(0.5)
 """The last grid of directions is this fine or finer; a paraboloid through it gives the answer."""
 
-MOST_POINTS = 600_000
+MOST_POINTS = 200_000
 """Points that are looked at, at even steps through the cloud."""
 
 PRIOR_TILT = math.radians(1.5)
@@ -109,7 +109,7 @@ def _sharpest(
 
     peak_only: return NaN where the sharpest lies on the border of what was looked at.
     """
-    height = max(float(np.ptp(np.quantile(xyz[:, 2], [0.05, 0.95]))), 1.0)
+    height = max(float(np.ptp(np.quantile(sample(xyz, 10_000)[:, 2], [0.05, 0.95]))), 1.0)
     cell = max(0.6, width * height / 16.0)
     finest = max(0.1, math.radians(0.2) * height)
     while True:

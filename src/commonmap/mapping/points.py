@@ -81,9 +81,16 @@ def sample(xyz: Float64s, n_most: int) -> Float64s:
 
 def sampled(n: int, n_most: int) -> NDArray[np.int64]:
     """Return which of n points `sample` takes where there are more than `n_most`, rising."""
-    run = np.arange(n_most, dtype=np.float64)
-    place: Float64s = (run + (run * GOLDEN) % 1.0) * (n / n_most)
-    return place.astype(np.int64)
+    return np.asarray(_sampled(n, n_most))
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _sampled(n, n_most):  # type: ignore[no-untyped-def]
+    place, width = np.empty(n_most, np.int64), n / n_most
+    for run in range(n_most):
+        turn = run * GOLDEN
+        place[run] = int((run + (turn - np.floor(turn))) * width)
+    return place
 
 
 def move(T_a_b: Float64s, xyz: Float64s) -> Float64s:
@@ -175,7 +182,7 @@ def _sort(key):  # type: ignore[no-untyped-def]
     By digits of 11 bits, the last one first: as many passes as the largest key has.
     """
     n, digit = key.shape[0], 11
-    order, sorted_key = np.arange(n), key.copy()
+    order, sorted_key = np.arange(n, dtype=np.int32), key.copy()
     next_order, next_key = np.empty_like(order), np.empty_like(key)
     place = np.empty((1 << digit) + 1, np.int64)
     most, shift = key.max() if n > 0 else 0, 0

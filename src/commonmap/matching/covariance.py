@@ -33,7 +33,7 @@ PATCHES = (64, 32, 16, 8, 4)
 LEAST_GRIP = 0.02
 """K resists at least this share of H: what is flatter than that is as good as unknown anyway."""
 
-PROBED_POINTS = 10_000
+PROBED_POINTS = 5_000
 """Points that K is measured on."""
 
 SMALLEST = np.diag([1e-4**2] * 3 + [1e-6**2] * 3)

@@ -15,13 +15,22 @@ from scipy.spatial.transform import Rotation
 
 from commonmap.frames import apply, from_rotation
 from commonmap.mapping.ground import Ground
-from commonmap.mapping.points import bounds, inside_box, move, thin
+from commonmap.mapping.points import bounds, inside_box, move, sample, thin
 from commonmap.matching.covariance import Pairs, Surface, measure_covariance, pair_points
 from commonmap.matching.neighbours import Normals, index_points
 from commonmap.types import Float64s
 
 MOST_WALKING = 5_000
 """Points of the source that walk from the search's peak."""
+
+MOST_SURFACE = 60_000
+"""Points of the target that they walk on."""
+
+MOST_SETTLING = 8_000
+"""Points of the source that walk on from there."""
+
+WALKED = 0.01
+"""A walk is over at steps of less than this share of a cell."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,14 +88,14 @@ def refine(
     T_target_source: Float64s,
     *,
     cell: float,
-    n_most: int = 20_000,
+    n_most: int = 40_000,
     settle: bool = True,
 ) -> Refined:
     """Return the pose refined on the points, starting from within about one `cell` of the truth.
 
     target_xyz: (N, 3), source_xyz: (M, 3) metres. cell: metres, of the search. Points are thinned
-    to one per voxel of a third of the cell, or coarser to stay near `n_most`. settle: end on finer
-    points, and measure the covariance.
+    to one per voxel of a third of the cell, or coarser to stay near `MOST_SETTLING`. settle: end on
+    finer points, and measure the covariance. n_most: points of the source that settle.
     """
     start = np.asarray(T_target_source, dtype=np.float64)
     moved_source = move(start, source_xyz)
@@ -99,24 +108,27 @@ def refine(
     # Work about the middle of the overlap: small numbers, and rotations that mean something
     centre = 0.5 * (low + high)
     voxel = max(cell / 3.0, 0.03)
-    target = thin(target_xyz[inside] - centre, voxel, 3 * n_most)
-    source = thin(moved_source - centre, voxel, n_most)
+    fine = max(0.05, 0.3 * voxel)
+    target, source = target_xyz[inside] - centre, moved_source - centre
+    if settle:
+        target, source = thin(target, fine, 2 * n_most), thin(source, fine, n_most)
 
-    # Walk from the search's peak with few points, then settle with more of them
-    surface = _surface(target, voxel)
+    # Walk from the search's peak with few points, then with more of them
     spacing, T = voxel, np.eye(4)
-    few = thin(source, cell, MOST_WALKING)
+    surface = _surface(thin(target, voxel, MOST_SURFACE), voxel)
+    some = thin(source, voxel, MOST_SETTLING)
+    few = thin(some, cell, MOST_WALKING)
     for reach in (3.0 * cell, 2.0 * cell, 1.5 * cell):
-        T, pairs = _solve_point_to_plane(surface, few, T, reach=reach)
+        T, pairs = _solve_point_to_plane(surface, few, T, reach=reach, until=WALKED * cell)
     for reach in (1.5 * cell, 0.75 * cell):
-        T, pairs = _solve_point_to_plane(surface, source, T, reach=reach)
+        T, pairs = _solve_point_to_plane(surface, some, T, reach=reach, until=WALKED * cell)
 
     # The last centimetres come from the finest points, within reach of what the last step left
-    fine = max(0.05, 0.3 * voxel)
     if settle and fine < voxel and pairs is not None and 4.0 * pairs.scale < 0.75 * cell:
         reach, spacing = max(4.0 * pairs.scale, 2.0 * fine), fine
-        surface = _surface(thin(target_xyz[inside] - centre, fine, 4 * n_most), fine)
-        source = thin(moved_source - centre, fine, 2 * n_most)
+        surface = _surface(target, fine)
+        few = sample(source, MOST_SETTLING)
+        T, pairs = _solve_point_to_plane(surface, few, T, reach=reach, until=1e-3)
         T, pairs = _solve_point_to_plane(surface, source, T, reach=reach)
     covariance, rms = np.eye(6), float("inf")
     if pairs is not None:
@@ -154,11 +166,11 @@ def _unrefined(start: Float64s, source_xyz: Float64s) -> Refined:
 
 
 def _solve_point_to_plane(
-    surface: Surface, source: Float64s, T: Float64s, *, reach: float
+    surface: Surface, source: Float64s, T: Float64s, *, reach: float, until: float = 1e-4
 ) -> tuple[Float64s, Pairs | None]:
     """Return (T, its pairs) after robust Gauss-Newton steps on point-to-plane residuals.
 
-    The pairs are None where too few points are within reach.
+    until: metres, of the last step. The pairs are None where too few points are within reach.
     """
     T = T.copy()
     for _ in range(8):
@@ -168,6 +180,6 @@ def _solve_point_to_plane(
         H = pairs.hessian() + 1e-6 * np.eye(6) * len(pairs.r)
         step = -np.linalg.solve(H, pairs.pulls().sum(axis=0))
         T = from_rotation(Rotation.from_rotvec(step[3:]).as_matrix(), step[:3]) @ T
-        if np.abs(step[:3]).max() < 1e-4 and np.abs(step[3:]).max() < 1e-5:
+        if np.abs(step[:3]).max() < until and np.abs(step[3:]).max() < 0.1 * until:
             break
     return T, pairs
