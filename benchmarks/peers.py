@@ -182,7 +182,7 @@ def overall_table(peers: dict[str, list[Record]]) -> list[str]:
             str(sum(is_wrong(r) for r in match)),
             f"{sum(is_wrong(r) for r in other)} of {len(other)}",
             f"{statistics.median(timed):.1f} ({max(timed):.0f})" if timed else "-",
-            f"{sum(timed) / right:.1f}" if right else "-",
+            _per_right(timed, right),
             f"{max(r.get('peak_mb', 0.0) for r in rows):.0f}",
         ]  # fmt: skip
         lines.append("| " + " | ".join(cells) + " |")
@@ -200,14 +200,24 @@ def family_table(peers: dict[str, list[Record]]) -> list[str]:
 
 
 def _family_cell(rows: list[Record]) -> str:
-    """Return "found of pairs, wrong ones accepted (of all), median CPU seconds"."""
+    """Return "found, wrong ones accepted, median CPU seconds (CPU seconds a right answer)".
+
+    The second and both times are over all pairs, those that do not match too.
+    """
     match = [r for r in rows if r["label"] == "match"]
     if not match:
         return "-"
     timed = [r["cpu_s"] for r in rows if "cpu_s" in r]
     time = f"{statistics.median(timed):.1f} s" if timed else "-"
     found = sum(is_within(r, RIGHT) for r in match)
-    return f"{found}/{len(match)}, {sum(map(is_wrong, rows))} wrong, {time}"
+    right = sum(r["accepted"] and is_within(r, RIGHT) for r in match)
+    wrong = sum(map(is_wrong, rows))
+    return f"{found}/{len(match)}, {wrong} wrong, {time} ({_per_right(timed, right)})"
+
+
+def _per_right(seconds: list[float], n_right: int) -> str:
+    """Return the time of all pairs over the answers that were accepted and right."""
+    return f"{sum(seconds) / n_right:.1f}" if n_right else "-"
 
 
 def settings_table(peers: dict[str, list[Record]]) -> list[str]:

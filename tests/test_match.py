@@ -315,25 +315,35 @@ def test_more_for_the_pose_never_lowers_the_confidence(
 
 
 @settings(max_examples=100, deadline=None, derandomize=True)
-@given(figure_sets(), st.sampled_from(["half_1", "half_2", "ground"]), st.floats(0.2, 1.0))
-def test_halves_that_fall_apart_and_ground_that_differs_lower_the_confidence(
+@given(figure_sets(), st.sampled_from(["half_1", "half_2", "ground", "moved"]), st.floats(0.2, 1.0))
+def test_halves_that_fall_apart_ground_that_differs_and_points_that_wander_lower_the_confidence(
     figures: Figures, name: str, share: float
 ) -> None:
-    whole = replace(figures, half_1=2.0, half_2=2.0, ground=0.1, decoy_ground=1.0)
-    worse = replace(whole, **{name: 2.0 * share if name != "ground" else 0.1 / share})
+    whole = replace(figures, half_1=2.0, half_2=2.0, ground=0.1, decoy_ground=1.0, moved=0.1)
+    worse = replace(whole, **{name: 2.0 * share if name in ("half_1", "half_2") else 0.1 / share})
     assert decide(worse).confidence <= decide(whole).confidence
 
 
 def test_the_halves_of_a_lucky_overlap_turn_the_verdict() -> None:
     doubtful = replace(
         figures_of_a_good_match(), decoy_ratio=3.0, second_ratio=2.5, prominence=15.0,
-        inliers=0.6, decoy_inliers=0.3,
+        inliers=0.6, decoy_inliers=0.3, ground=0.1, decoy_ground=0.25,
     )  # fmt: skip
     assert is_open(doubtful)
     assert decide(replace(doubtful, half_1=3.0, half_2=2.5)).accepted
     apart = decide(replace(doubtful, half_1=1.3, half_2=0.4))
     assert not apart.accepted
     assert "half" in apart.reason
+
+
+def test_points_that_settle_elsewhere_turn_a_doubtful_verdict_and_are_named() -> None:
+    doubtful = replace(
+        figures_of_a_good_match(), decoy_ratio=4.0, second_ratio=4.0, ground=0.05, decoy_ground=0.3,
+    )  # fmt: skip
+    assert decide(doubtful).accepted
+    wandered = decide(replace(doubtful, moved=1.8))
+    assert not wandered.accepted
+    assert "1.8 cells" in wandered.reason
 
 
 @settings(max_examples=100, deadline=None, derandomize=True)

@@ -10,7 +10,7 @@ from commonmap.frames import from_xyz_yaw
 from commonmap.matching.halves import measure_halves
 from commonmap.matching.maps import Points, build_layers, choose_grid, prepare
 from commonmap.matching.search import search
-from commonmap.matching.verify import ground_misfit
+from commonmap.matching.verify import Maps, ground_misfit
 from commonmap.types import Float64s
 from matching_scenes import look, make_place
 
@@ -36,6 +36,53 @@ def test_the_same_hills_fit_and_shifted_ones_do_not() -> None:
     assert shifted is not None and 0.5 < shifted < 1.2
     away = ground_misfit(base, points, here @ from_xyz_yaw(900.0, 0.0, 0.0, 0.0))
     assert away is None
+
+
+def maps_of(base_side: float, draft_side: float) -> Maps:
+    """Return the maps of two patches of even ground with posts, 25 points a square metre."""
+    rng = np.random.default_rng(2)
+
+    def patch(side: float) -> Float64s:
+        ground = rng.uniform(-0.5 * side, 0.5 * side, (int(25 * side**2), 2))
+        posts = np.repeat(rng.uniform(-0.5 * side, 0.5 * side, (40, 2)), 100, axis=0)
+        z = rng.uniform(0.0, 4.0, len(posts))
+        return np.vstack(
+            [np.column_stack([ground, 0.0 * ground[:, 0]]), np.column_stack([posts, z])]
+        )
+
+    off = Config().with_values(level={"mode": "off"})
+    base, draft = (
+        prepare(patch(base_side), "target", off),
+        prepare(patch(draft_side), "source", off),
+    )
+    cell, edges, max_height = choose_grid(base, draft, off)
+    layers = [build_layers(item, cell, edges, max_height) for item in (base, draft)]
+    return Maps(base, draft, layers[0], layers[1], cell, edges, max_height)
+
+
+def test_looks_share_the_points_of_a_small_base_and_see_what_each_would_see_alone() -> None:
+    maps = maps_of(40.0, 40.0)
+    shared = maps.with_base_points()
+    assert shared.base_points is not None
+    around = np.array([[-8.0, -6.0, 0.0], [5.0, 9.0, 2.0]])
+    alone, together = maps.points_near(around), shared.points_near(around)
+    # but for the voxels on the border: one alone is of the points inside
+    low, high = around.min(axis=0)[:2] - maps.cell, around.max(axis=0)[:2] + maps.cell
+    for name in ("xyz", "height", "standing"):
+        one, other = (
+            getattr(points, name)[((points.xyz[:, :2] > low) & (points.xyz[:, :2] < high)).all(1)]
+            for points in (alone, together)
+        )
+        np.testing.assert_array_equal(one, other)
+    reach = 3.0 * maps.cell
+    assert np.abs(together.xyz[:, 0]).max() <= 8.0 + reach
+    assert np.abs(together.xyz[:, 1]).max() <= 9.0 + reach
+    assert len(together.xyz) > 5_000
+
+
+def test_a_large_base_is_not_thinned_as_a_whole() -> None:
+    maps = maps_of(60.0, 20.0)
+    assert maps.with_base_points() is maps
 
 
 def halves_of(seed_target: int, seed_source: int, workers: int = 2) -> tuple[float, float] | None:

@@ -26,7 +26,7 @@ MAX_SIGMA = math.radians(2.0)
 FINEST_STEP = math.radians(0.5)
 """The last grid of directions is this fine or finer; a paraboloid through it gives the answer."""
 
-MOST_POINTS = 200_000
+MOST_POINTS = 600_000
 """Points that are looked at, at even steps through the cloud."""
 
 PRIOR_TILT = math.radians(1.5)

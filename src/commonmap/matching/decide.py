@@ -1,11 +1,11 @@
 """Accepted or refused, with the reason. A wrong answer accepted is the worst there is.
 
 The figures compare the best pose with what chance reaches in the very same maps: the best pose of
-the mirrored source (the decoy), the best pose elsewhere (the second), the best poses of all other
-headings; and with how the points lie on each other at the decoy's pose. A logistic model, fitted to
-simulated pairs of many kinds (`benchmarks/decision.py`, docs/matching.md), makes one probability of
-them. Two things no probability makes up for: a refinement that left the peak, and too little
-evidence to fix a pose.
+the mirrored source (the decoy) and the best pose elsewhere (the second); and with how the points
+lie on each other at the decoy's pose. The points have a word of their own: how far they move away
+from the search's pose. A logistic model, fitted to simulated pairs of many kinds
+(`benchmarks/decision.py`, docs/matching.md), makes one probability of them. Two things no
+probability makes up for: a refinement that left the peak, and too little evidence to fix a pose.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Figures:
         other pose; None where it was not looked for (the verdict was clear) or too little stands.
     overlap: share of the source's known cells on known cells of the target (0 to 1).
     n_overlap: the number of those cells.
-    moved: refinement's step at the middle of the overlap, in cells.
+    moved: how far the refinement went from the search's pose, at the middle of the overlap, cells.
     converged: 1 where the refinement stayed in the basin of the search's peak.
     """
 
@@ -83,13 +83,12 @@ LEAST_EVIDENCE = 100.0
 independent tenth of it is left, which chance among a million poses reaches once in a while."""
 
 WEIGHTS = {
-    "bias": -9.01, "ratios": 1.9, "prominence": 1.62, "inliers": 0.74, "ground": 1.88,
-    "halves": 1.81,
+    "bias": -4.31, "ratios": 1.6, "inliers": 0.77, "ground": 2.51, "halves": 1.31, "moved": -2.55,
 }  # fmt: skip
 """Of the logistic model; see `features`."""
 
 QUICK_WEIGHTS = {
-    "bias": -11.48, "ratios": 2.57, "prominence": 1.78, "inliers": 1.12, "ground": 2.65,
+    "bias": -5.14, "ratios": 2.11, "inliers": 0.67, "ground": 2.7, "moved": -3.22,
 }  # fmt: skip
 """Of the model without the halves, which decides where it is sure."""
 
@@ -105,9 +104,9 @@ def features(figures: Figures) -> dict[str, float]:
     seen = {
         "bias": 1.0,
         "ratios": _log(figures.decoy_ratio) + _log(figures.second_ratio),
-        "prominence": math.log(max(figures.prominence, 1.0)),
         "inliers": min(max(figures.inliers - figures.decoy_inliers, -0.2), 0.5),
         "ground": 0.0,
+        "moved": math.log1p(max(figures.moved, 0.0)),
     }
     if figures.ground is not None and figures.decoy_ground is not None:
         flatter = (figures.decoy_ground + GROUND_NOISE) / (figures.ground + GROUND_NOISE)
@@ -195,6 +194,11 @@ def _weakness(figures: Figures) -> str:
             "the points lie no better on each other than by chance: "
             f"{100 * figures.inliers:.0f} % within one cell, a mirrored map "
             f"{100 * figures.decoy_inliers:.0f} %"
+        )
+    if figures.moved > 1.0:
+        return (
+            f"the points settle {figures.moved:.1f} cells away from where the height maps agree "
+            "best; what both show of one place settles within one"
         )
     return "the signs of a true match, taken together, are too weak to rely on"
 

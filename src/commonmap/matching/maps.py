@@ -121,8 +121,18 @@ def choose_points(
     """
     xyz = item.xyz if max_height is None else item.xyz[item.height < max_height]
     if around is not None:
-        low, high = bounds(around)
-        xyz = xyz[inside_box(xyz, (low - 3.0 * cell)[:2], (high + 3.0 * cell)[:2])]
+        xyz = xyz[_is_around(xyz, around, cell)]
     xyz = thin(sample(xyz, MOST_POINTS), min(0.25 * cell, 0.1))
     height = xyz[:, 2] - item.ground.height_at(xyz[:, :2])
     return Points(xyz, height, height > edges[0])
+
+
+def points_around(points: Points, around: Float64s, cell: float) -> Points:
+    """Return the points within three cells of the plan of (K, 3) points, metres."""
+    inside = _is_around(points.xyz, around, cell)
+    return Points(points.xyz[inside], points.height[inside], points.standing[inside])
+
+
+def _is_around(xyz: Float64s, around: Float64s, cell: float) -> Bools:
+    low, high = bounds(around)
+    return inside_box(xyz, (low - 3.0 * cell)[:2], (high + 3.0 * cell)[:2])

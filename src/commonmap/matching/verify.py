@@ -19,7 +19,14 @@ from commonmap.matching.figures import (
     other_poses,
 )
 from commonmap.matching.halves import measure_halves
-from commonmap.matching.maps import Layers, Points, Prepared, choose_points
+from commonmap.matching.maps import (
+    MOST_POINTS,
+    Layers,
+    Points,
+    Prepared,
+    choose_points,
+    points_around,
+)
 from commonmap.matching.refine import Refined, lift, refine
 from commonmap.matching.search import Peaks
 from commonmap.types import Float64s
@@ -39,7 +46,10 @@ LOW = 0.3
 
 @dataclass(frozen=True, eq=False)
 class Maps:
-    """Both maps as the search and the points see them. cell: metres. edges: of the slabs."""
+    """Both maps as the search and the points see them. cell: metres. edges: of the slabs.
+
+    base_points: of the whole base, where it is so small that every look may share them.
+    """
 
     base: Prepared
     draft: Prepared
@@ -48,10 +58,20 @@ class Maps:
     cell: float
     edges: Float64s
     max_height: float | None
+    base_points: Points | None = None
 
     def points_near(self, placed: Float64s) -> Points:
         """Return the base's points about (N, 3) points of its frame."""
+        if self.base_points is not None:
+            return points_around(self.base_points, placed, self.cell)
         return choose_points(self.base, self.cell, self.edges, self.max_height, around=placed)
+
+    def with_base_points(self) -> Maps:
+        """Return the maps with the base's points, if it has few enough for all of them."""
+        if len(self.base.xyz) > min(MOST_POINTS, 2 * len(self.draft.xyz)):
+            return self
+        points = choose_points(self.base, self.cell, self.edges, self.max_height)
+        return replace(self, base_points=points)
 
     def draft_points(self) -> Points:
         """Return the draft's points."""
@@ -76,7 +96,7 @@ def verify(
     mirrored. on_evidence: the peaks of `found` are the evidence's own, so that close ones may
     change places by what the points say.
     """
-    points = maps.draft_points()
+    points, maps = both(maps.draft_points, maps.with_base_points)
     if on_evidence:
         found = _choose(maps, points, found, workers)
     look, chance = both(
