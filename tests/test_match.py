@@ -292,6 +292,7 @@ def figure_sets() -> st.SearchStrategy[Figures]:
         evidence=st.floats(0.0, 1e5),
         ground=st.none() | st.floats(0.0, 5.0),
         decoy_ground=st.none() | st.floats(0.0, 5.0),
+        second_ground=st.none() | st.floats(0.0, 5.0),
         half_1=st.none() | ratio,
         half_2=st.none() | ratio,
     )

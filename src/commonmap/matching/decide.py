@@ -30,6 +30,8 @@ class Figures:
     decoy_inliers: the same at the refined pose of the mirrored source.
     ground, decoy_ground: metres, by which the source's ground undulates against the target's at the
         pose, and at the mirrored source's; None where too little ground is shared.
+    second_ground: the same at the best pose elsewhere; None also where it was not looked at (the
+        verdict was clear).
     half_1, half_2: evidence of each half of the overlap at the pose, over that half's best at any
         other pose; None where it was not looked for (the verdict was clear) or too little stands.
     overlap: share of the source's known cells on known cells of the target (0 to 1).
@@ -54,6 +56,7 @@ class Figures:
     converged: float
     ground: float | None = None
     decoy_ground: float | None = None
+    second_ground: float | None = None
     half_1: float | None = None
     half_2: float | None = None
 
@@ -83,34 +86,36 @@ LEAST_EVIDENCE = 100.0
 independent tenth of it is left, which chance among a million poses reaches once in a while."""
 
 WEIGHTS = {
-    "bias": -4.31, "ratios": 1.6, "inliers": 0.77, "ground": 2.51, "halves": 1.31, "moved": -2.55,
+    "bias": -3.33, "ratios": 1.27, "inliers": 0.77, "ground": 3.44, "halves": 1.4, "moved": -3.55,
 }  # fmt: skip
 """Of the logistic model; see `features`."""
 
 QUICK_WEIGHTS = {
-    "bias": -5.14, "ratios": 2.11, "inliers": 0.67, "ground": 2.7, "moved": -3.22,
+    "bias": -4.97, "ratios": 2.02, "inliers": 0.72, "ground": 3.88, "moved": -4.06,
 }  # fmt: skip
-"""Of the model without the halves, which decides where it is sure."""
+"""Of the model without the closer look, which decides where it is sure."""
 
 OPEN = (0.001, 0.9995)
-"""Between these probabilities the quick model is not sure, and the halves are looked for."""
+"""Between these probabilities the quick model is not sure, and a closer look follows: at the halves
+of the overlap, and at the ground under the best pose elsewhere."""
 
-GROUND_NOISE = 0.05
-"""Metres, of what two lidars see of one ground."""
+GROUND_NOISE = 0.15
+"""Metres, of what two lidars see of one ground under growth."""
 
 
 def features(figures: Figures) -> dict[str, float]:
-    """Return what the logistic model sees: logarithms of bounded ratios, and a bounded share."""
+    """Return what the logistic model sees: logarithms of bounded ratios, odds and distances."""
     seen = {
         "bias": 1.0,
         "ratios": _log(figures.decoy_ratio) + _log(figures.second_ratio),
-        "inliers": min(max(figures.inliers - figures.decoy_inliers, -0.2), 0.5),
+        "inliers": min(max(_odds(figures.inliers) - _odds(figures.decoy_inliers), -1.0), 3.0),
         "ground": 0.0,
         "moved": math.log1p(max(figures.moved, 0.0)),
     }
-    if figures.ground is not None and figures.decoy_ground is not None:
-        flatter = (figures.decoy_ground + GROUND_NOISE) / (figures.ground + GROUND_NOISE)
-        seen["ground"] = math.log(min(max(flatter, 0.4), 10.0))
+    chance = [g for g in (figures.decoy_ground, figures.second_ground) if g is not None]
+    if figures.ground is not None and chance:
+        flatter = [(g + GROUND_NOISE) / (figures.ground + GROUND_NOISE) for g in chance]
+        seen["ground"] = sum(math.log(min(max(f, 0.4), 10.0)) for f in flatter) / len(flatter)
     if figures.half_1 is not None and figures.half_2 is not None:
         seen["halves"] = sum(
             math.log(min(max(half, 0.25), 4.0)) for half in (figures.half_1, figures.half_2)
@@ -127,14 +132,15 @@ def probability(figures: Figures) -> float:
 
 
 def is_open(figures: Figures) -> bool:
-    """Return whether the figures without the halves leave the verdict open."""
-    quick = replace(figures, half_1=None, half_2=None)
+    """Return whether the figures without the halves and the second look leave the verdict open."""
+    quick = replace(figures, half_1=None, half_2=None, second_ground=None)
     return OPEN[0] < probability(quick) < OPEN[1]
 
 
 def rank_value(score: float, inliers: float, ground: float | None) -> float:
     """Return what poses of one search are compared by, in logits of the model."""
-    value = 2.0 * WEIGHTS["ratios"] * math.log(max(score, 1e-9)) + WEIGHTS["inliers"] * inliers
+    value = 2.0 * WEIGHTS["ratios"] * math.log(max(score, 1e-9))
+    value += WEIGHTS["inliers"] * _odds(inliers)
     if ground is not None:
         value -= WEIGHTS["ground"] * math.log(ground + GROUND_NOISE)
     return value
@@ -206,3 +212,9 @@ def _weakness(figures: Figures) -> str:
 def _log(ratio: float) -> float:
     """Return the logarithm of a ratio between 1/4 and 20."""
     return math.log(min(max(ratio, 0.25), 20.0))
+
+
+def _odds(share: float) -> float:
+    """Return the logarithm of the odds of a share, of one between 0.02 and 0.98."""
+    share = min(max(share, 0.02), 0.98)
+    return math.log(share / (1.0 - share))

@@ -113,12 +113,26 @@ def verify(
         decoy_ground=None if chance is None else chance.ground,
     )
     if is_open(figures):
-        halves = measure_halves(
-            maps.base_layers.slabs, maps.draft_layers.slabs, found, maps.cell, workers=workers
-        )
-        if halves is not None:
-            figures = replace(figures, half_1=halves[0], half_2=halves[1])
+        figures = _look_closer(maps, points, found, figures, workers)
     return found, look.refined, figures
+
+
+def _look_closer(
+    maps: Maps, points: Points, found: Peaks, figures: Figures, workers: int
+) -> Figures:
+    """Return the figures with what settles a doubt: the overlap's halves, the ground elsewhere."""
+    elsewhere = np.nonzero(other_poses(found, found.pose[0], maps.cell))[0]
+    halves, second = both(
+        lambda: measure_halves(
+            maps.base_layers.slabs, maps.draft_layers.slabs, found, maps.cell, workers=workers
+        ),
+        lambda: (
+            _look(maps, points, found, int(elsewhere[0]), quick=True) if len(elsewhere) else None
+        ),
+    )
+    if halves is not None:
+        figures = replace(figures, half_1=halves[0], half_2=halves[1])
+    return replace(figures, second_ground=None if second is None else second.ground)
 
 
 def _choose(maps: Maps, points: Points, found: Peaks, workers: int) -> Peaks:
