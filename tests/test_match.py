@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from commonmap.config import Config
 from commonmap.errors import EmptyMapError, InputError
-from commonmap.matching.decide import Figures, decide, is_open
+from commonmap.matching.decide import Figures, decide, features, is_open
 from commonmap.matching.match import match
 from commonmap.types import Cloud, Float64s, Leaves, Match
 from matching_scenes import apart, look, make_place, moved, rigid
@@ -323,6 +323,42 @@ def test_halves_that_fall_apart_ground_that_differs_and_points_that_wander_lower
     whole = replace(figures, half_1=2.0, half_2=2.0, ground=0.1, decoy_ground=1.0, moved=0.1)
     worse = replace(whole, **{name: 2.0 * share if name in ("half_1", "half_2") else 0.1 / share})
     assert decide(worse).confidence <= decide(whole).confidence
+
+
+def test_the_features_of_the_verdict_in_numbers() -> None:
+    seen = features(
+        replace(
+            figures_of_a_good_match(), decoy_ratio=4.0, second_ratio=2.0, inliers=0.6,
+            decoy_inliers=0.4, ground=0.05, decoy_ground=0.45, second_ground=0.25, moved=0.5,
+            half_1=2.0, half_2=0.1,
+        )
+    )  # fmt: skip
+    assert seen == pytest.approx(
+        {
+            "bias": 1.0,
+            "ratios": math.log(8.0),
+            "inliers": 2.0 * math.log(0.6 / 0.4),
+            "ground": 0.5 * (math.log(0.6 / 0.2) + math.log(0.4 / 0.2)),
+            "moved": math.log(1.5),
+            "halves": math.log(2.0) + math.log(0.25),  # bounded at a quarter
+        }
+    )
+    # where nothing is measured nothing speaks
+    assert features(figures_of_a_good_match())["ground"] == 0.0
+    sure = replace(figures_of_a_good_match(), inliers=1.0, decoy_inliers=0.0)
+    assert features(sure)["inliers"] == 3.0
+
+
+@pytest.mark.parametrize(("other", "looks_closer"), [(0, False), (60, True)])
+def test_a_doubtful_verdict_is_looked_at_closer_and_a_clear_one_is_not(
+    other: int, looks_closer: bool
+) -> None:
+    rng = np.random.default_rng(4)
+    base = look(make_place(4), rng)
+    draft = look(make_place(4 + other), rng, roofs=False, edge=26.0)
+    figures = match(base, draft).evidence
+    for name in ("half_1", "half_2", "second_ground"):
+        assert (name in figures) == looks_closer
 
 
 def test_the_halves_of_a_lucky_overlap_turn_the_verdict() -> None:
