@@ -198,7 +198,7 @@ def _match_alone(
         return None
     decoy = search(layers[0].slabs, slabs, min_overlap=LEAST_OVERLAP, mirrored=True)
     T = lift(found.T_target_source(), base.ground, draft.ground)
-    refined = refine(there.xyz, own.xyz, T, cell=max(cell, found.cell), n_most=8_000)
+    refined = refine(there.xyz, own.xyz, T, cell=max(cell, found.cell), n_most=16_000)
     inliers = measure_inliers(there, own, refined.T_target_source, cell)
     chance = 0.0
     if len(decoy.score):
@@ -207,8 +207,7 @@ def _match_alone(
         chance = measure_inliers(
             there, mirrored,
             refine(
-                there.xyz, mirrored.xyz, T_mirrored, cell=max(cell, decoy.cell), n_most=8_000,
-                settle=False,
+                there.xyz, mirrored.xyz, T_mirrored, cell=max(cell, decoy.cell), settle=False,
             ).T_target_source,
             cell,
         )  # fmt: skip

@@ -1,8 +1,8 @@
 """From the grid's pose to the points' pose: z in closed form, then 6-DoF registration.
 
 Robust point-to-plane steps (Chen and Medioni 1992) walk from the search's peak, a few points with
-pairs of falling reach, then all coarse points, then fine ones. What the answer is worth is measured
-by `covariance.py`.
+pairs of falling reach, then more of them, and settle on fine ones. What the answer is worth is
+measured by `covariance.py`.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from commonmap.types import Float64s
 MOST_WALKING = 5_000
 """Points of the source that walk from the search's peak."""
 
+MOST_ARRIVING = 8_000
+"""Points of the source that walk on where these arrived."""
+
 MOST_SURFACE = 60_000
 """Points of the target that they walk on."""
-
-MOST_SETTLING = 8_000
-"""Points of the source that walk on from there."""
 
 WALKED = 0.01
 """A walk is over at steps of less than this share of a cell."""
@@ -94,8 +94,8 @@ def refine(
     """Return the pose refined on the points, starting from within about one `cell` of the truth.
 
     target_xyz: (N, 3), source_xyz: (M, 3) metres. cell: metres, of the search. Points are thinned
-    to one per voxel of a third of the cell, or coarser to stay near `MOST_SETTLING`. settle: end on
-    finer points, and measure the covariance. n_most: points of the source that settle.
+    to one per voxel of a third of the cell, or coarser. settle: end on finer points, about `n_most`
+    of the source, and measure the covariance.
     """
     start = np.asarray(T_target_source, dtype=np.float64)
     moved_source = move(start, source_xyz)
@@ -116,7 +116,7 @@ def refine(
     # Walk from the search's peak with few points, then with more of them
     spacing, T = voxel, np.eye(4)
     surface = _surface(thin(target, voxel, MOST_SURFACE), voxel)
-    some = thin(source, voxel, MOST_SETTLING)
+    some = thin(source, voxel, MOST_ARRIVING)
     few = thin(some, cell, MOST_WALKING)
     for reach in (3.0 * cell, 2.0 * cell, 1.5 * cell):
         T, pairs = _solve_point_to_plane(surface, few, T, reach=reach, until=WALKED * cell)
@@ -124,10 +124,11 @@ def refine(
         T, pairs = _solve_point_to_plane(surface, some, T, reach=reach, until=WALKED * cell)
 
     # The last centimetres come from the finest points, within reach of what the last step left
-    if settle and fine < voxel and pairs is not None and 4.0 * pairs.scale < 0.75 * cell:
-        reach, spacing = max(4.0 * pairs.scale, 2.0 * fine), fine
-        surface = _surface(target, fine)
-        few = sample(source, MOST_SETTLING)
+    if settle and pairs is not None:
+        if 4.0 * pairs.scale < 0.75 * cell:
+            reach, spacing = max(4.0 * pairs.scale, 2.0 * fine), fine
+            surface = _surface(target, fine)
+        few = sample(source, MOST_ARRIVING)
         T, pairs = _solve_point_to_plane(surface, few, T, reach=reach, until=1e-3)
         T, pairs = _solve_point_to_plane(surface, source, T, reach=reach)
     covariance, rms = np.eye(6), float("inf")

@@ -161,7 +161,7 @@ def _look(maps: Maps, points: Points, found: Peaks, rank: int, *, quick: bool = 
     there = maps.points_near(move(T, points.xyz))
     cell = max(maps.cell, found.cell)
     if quick:
-        refined = refine(there.xyz, points.xyz, T, cell=cell, n_most=8_000, settle=False)
+        refined = refine(there.xyz, points.xyz, T, cell=cell, settle=False)
     else:
         refined = refine(there.xyz, points.xyz, T, cell=cell)
     T = refined.T_target_source
@@ -178,7 +178,7 @@ def _look_mirrored(maps: Maps, points: Points, decoy: Peaks) -> Look | None:
     T = lift_mirrored(decoy.T_target_source(), maps.base, mirrored)
     there = maps.points_near(move(T, mirrored.xyz))
     cell = max(maps.cell, decoy.cell)
-    refined = refine(there.xyz, mirrored.xyz, T, cell=cell, n_most=8_000, settle=False)
+    refined = refine(there.xyz, mirrored.xyz, T, cell=cell, settle=False)
     return Look(
         refined,
         measure_inliers(there, mirrored, refined.T_target_source, maps.cell),
