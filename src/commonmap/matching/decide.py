@@ -86,12 +86,12 @@ LEAST_EVIDENCE = 100.0
 independent tenth of it is left, which chance among a million poses reaches once in a while."""
 
 WEIGHTS = {
-    "bias": -3.33, "ratios": 1.27, "inliers": 0.77, "ground": 3.44, "halves": 1.4, "moved": -3.55,
+    "bias": -4.67, "ratios": 1.73, "inliers": 1.5, "ground": 3.83, "halves": 1.72, "moved": -3.97,
 }  # fmt: skip
 """Of the logistic model; see `features`."""
 
 QUICK_WEIGHTS = {
-    "bias": -4.97, "ratios": 2.02, "inliers": 0.72, "ground": 3.88, "moved": -4.06,
+    "bias": -5.57, "ratios": 2.26, "inliers": 1.33, "ground": 4.37, "moved": -5.19,
 }  # fmt: skip
 """Of the model without the closer look, which decides where it is sure."""
 
