@@ -375,7 +375,8 @@ def test_the_halves_of_a_lucky_overlap_turn_the_verdict() -> None:
 
 def test_points_that_settle_elsewhere_turn_a_doubtful_verdict_and_are_named() -> None:
     doubtful = replace(
-        figures_of_a_good_match(), decoy_ratio=4.0, second_ratio=4.0, ground=0.05, decoy_ground=0.3,
+        figures_of_a_good_match(), decoy_ratio=4.0, second_ratio=4.0, inliers=0.7,
+        decoy_inliers=0.45, ground=0.05, decoy_ground=0.3,
     )  # fmt: skip
     assert decide(doubtful).accepted
     wandered = decide(replace(doubtful, moved=1.8))
