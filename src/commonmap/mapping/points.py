@@ -129,10 +129,10 @@ def thin(xyz: Float64s, voxel: float, n_most: int | None = None) -> Float64s:
 def first_of_voxels(xyz: Float64s, voxel: float) -> NDArray[np.int64]:
     """Return the index of the first point of every voxel of a width in metres, rising."""
     order, starts = _group(xyz, voxel)
-    return np.sort(order[starts[:-1]])
+    return np.sort(order[starts[:-1]]).astype(np.int64)
 
 
-def _group(xyz: Float64s, voxel: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _group(xyz: Float64s, voxel: float) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """Return the points' order by voxel, and where each voxel starts in it."""
     xyz, scale = np.ascontiguousarray(xyz), 1.0 / voxel
     low, high = (np.floor(end * scale) for end in bounds(xyz))
@@ -179,7 +179,7 @@ def _voxel_keys(xyz, scale, low, shape):  # type: ignore[no-untyped-def]
 def _sort(key):  # type: ignore[no-untyped-def]
     """Return the order of keys of 0 and up, equal ones as they came, and the sorted keys.
 
-    By digits of 11 bits, the last one first: as many passes as the largest key has.
+    By digits of 11 bits, the last one first: as many passes as the largest key has. Up to 2^31 keys.
     """
     n, digit = key.shape[0], 11
     order, sorted_key = np.arange(n, dtype=np.int32), key.copy()
