@@ -179,7 +179,7 @@ def _voxel_keys(xyz, scale, low, shape):  # type: ignore[no-untyped-def]
 def _sort(key):  # type: ignore[no-untyped-def]
     """Return the order of keys of 0 and up, equal ones as they came, and the sorted keys.
 
-    By digits of 11 bits, the last one first: as many passes as the largest key has. Up to 2^31 keys.
+    By digits of 11 bits, the last one first: as many passes as the largest key has. n < 2^31.
     """
     n, digit = key.shape[0], 11
     order, sorted_key = np.arange(n, dtype=np.int32), key.copy()
