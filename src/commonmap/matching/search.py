@@ -71,7 +71,7 @@ class SearchPlan:
     keep: tuple[int, ...]
 
 
-def plan_search(target: SlabGrid, source: SlabGrid, *, budget: float = 2.5e7) -> SearchPlan:
+def plan_search(target: SlabGrid, source: SlabGrid, *, budget: float = 1e8) -> SearchPlan:
     """Return the pyramid of cells and the number of yaws for two grids of half the finest cell.
 
     The coarsest cell is the finest one that keeps the exhaustive part within `budget` (padded
