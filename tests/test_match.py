@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from commonmap.config import Config
 from commonmap.errors import EmptyMapError, InputError
-from commonmap.matching.decide import Figures, decide, features, is_open
+from commonmap.matching.decide import Figures, decide, features, is_open, told_apart
 from commonmap.matching.match import match
 from commonmap.types import Cloud, Float64s, Leaves, Match
 from matching_scenes import apart, look, make_place, moved, rigid
@@ -340,7 +340,8 @@ def test_the_features_of_the_verdict_in_numbers() -> None:
             "inliers": 2.0 * math.log(0.6 / 0.4),
             "ground": 0.5 * (math.log(0.6 / 0.2) + math.log(0.4 / 0.2)),
             "moved": math.log(1.5),
-            "halves": math.log(2.0) + math.log(0.25),  # bounded at a quarter
+            "better_half": math.log(2.0),
+            "weaker_half": math.log(0.25),  # bounded at a quarter
         }
     )
     # where nothing is measured nothing speaks
@@ -371,6 +372,19 @@ def test_the_halves_of_a_lucky_overlap_turn_the_verdict() -> None:
     apart = decide(replace(doubtful, half_1=1.3, half_2=0.4))
     assert not apart.accepted
     assert "half" in apart.reason
+
+
+@pytest.mark.parametrize(
+    ("ratio", "told"), [(1.0, 0.5), (1.5, 0.962), (0.5, 0.004), (3.0, 1.0), (0.0, 0.0)]
+)
+def test_two_poses_are_told_apart_by_their_evidence_alone(ratio: float, told: float) -> None:
+    sure = replace(
+        figures_of_a_good_match(), second_ratio=ratio, ground=0.02, decoy_ground=2.0, half_1=4.0,
+        half_2=4.0,
+    )  # fmt: skip
+    assert told_apart(ratio) == pytest.approx(told, abs=1e-3)
+    assert decide(sure).confidence <= told + 1e-3
+    assert decide(sure).accepted == (told >= 0.9)
 
 
 def test_points_that_settle_elsewhere_turn_a_doubtful_verdict_and_are_named() -> None:

@@ -48,6 +48,7 @@ from commonmap.matching.maps import (
 from commonmap.matching.refine import lift, refine
 from commonmap.matching.search import Peaks, search
 from commonmap.matching.slabs import SlabGrid
+from commonmap.matching.verify import ground_misfit
 from commonmap.types import (
     Area,
     Areas,
@@ -199,23 +200,23 @@ def _match_alone(
     decoy = search(layers[0].slabs, slabs, min_overlap=LEAST_OVERLAP, mirrored=True)
     T = lift(found.T_target_source(), base.ground, draft.ground)
     refined = refine(there.xyz, own.xyz, T, cell=max(cell, found.cell), n_most=16_000)
-    inliers = measure_inliers(there, own, refined.T_target_source, cell)
-    chance = 0.0
-    if len(decoy.score):
-        mirrored = mirror(own, decoy)
-        T_mirrored = lift_mirrored(decoy.T_target_source(), base, mirrored)
-        chance = measure_inliers(
-            there, mirrored,
-            refine(
-                there.xyz, mirrored.xyz, T_mirrored, cell=max(cell, decoy.cell), settle=False,
-            ).T_target_source,
-            cell,
-        )  # fmt: skip
     part = Layers(layers[1].grid, slabs)
     figures = replace(
         measure_figures(layers[0], part, found, found, decoy, refined, cell),
-        inliers=inliers, decoy_inliers=chance,
-    )  # fmt: skip
+        inliers=measure_inliers(there, own, refined.T_target_source, cell),
+        ground=ground_misfit(base, own, refined.T_target_source),
+    )
+    if len(decoy.score):
+        mirrored = mirror(own, decoy)
+        T_mirrored = lift_mirrored(decoy.T_target_source(), base, mirrored)
+        chance = refine(
+            there.xyz, mirrored.xyz, T_mirrored, cell=max(cell, decoy.cell), settle=False
+        ).T_target_source
+        figures = replace(
+            figures,
+            decoy_inliers=measure_inliers(there, mirrored, chance, cell),
+            decoy_ground=ground_misfit(base, mirrored, T_mirrored),
+        )
     return Alone(found, refined.T_target_source, decide(figures))
 
 

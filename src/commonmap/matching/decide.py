@@ -85,13 +85,18 @@ LEAST_EVIDENCE = 100.0
 """Evidence in nats under which no pose is accepted. Neighbouring cells say much the same, so an
 independent tenth of it is left, which chance among a million poses reaches once in a while."""
 
+APART = 8.0
+"""Two poses whose evidence differs by a factor f are told apart with odds of f to this power: even
+odds for one, nine to one for a third more."""
+
 WEIGHTS = {
-    "bias": -4.67, "ratios": 1.73, "inliers": 1.5, "ground": 3.83, "halves": 1.72, "moved": -3.97,
+    "bias": -3.8, "ratios": 0.56, "inliers": 1.41, "ground": 2.84, "better_half": 4.05,
+    "weaker_half": 0.82, "moved": -3.0,
 }  # fmt: skip
 """Of the logistic model; see `features`."""
 
 QUICK_WEIGHTS = {
-    "bias": -5.57, "ratios": 2.26, "inliers": 1.33, "ground": 4.37, "moved": -5.19,
+    "bias": -2.91, "ratios": 1.56, "inliers": 1.37, "ground": 3.07, "moved": -4.83,
 }  # fmt: skip
 """Of the model without the closer look, which decides where it is sure."""
 
@@ -117,18 +122,26 @@ def features(figures: Figures) -> dict[str, float]:
         flatter = [(g + GROUND_NOISE) / (figures.ground + GROUND_NOISE) for g in chance]
         seen["ground"] = sum(math.log(min(max(f, 0.4), 10.0)) for f in flatter) / len(flatter)
     if figures.half_1 is not None and figures.half_2 is not None:
-        seen["halves"] = sum(
-            math.log(min(max(half, 0.25), 4.0)) for half in (figures.half_1, figures.half_2)
-        )
+        halves = (math.log(min(max(h, 0.25), 4.0)) for h in (figures.half_1, figures.half_2))
+        seen["weaker_half"], seen["better_half"] = sorted(halves)
     return seen
 
 
 def probability(figures: Figures) -> float:
     """Return the probability, 0 to 1, that the pose is right."""
     x = features(figures)
-    weights = WEIGHTS if "halves" in x else QUICK_WEIGHTS
+    weights = WEIGHTS if "better_half" in x else QUICK_WEIGHTS
     logit = sum(weights[name] * x[name] for name in weights)
     return 1.0 / (1.0 + math.exp(-max(-40.0, min(40.0, logit))))
+
+
+def told_apart(second_ratio: float) -> float:
+    """Return the probability, 0 to 1, that the best pose is not the best one elsewhere.
+
+    Where a place repeats itself the points lie on each other at the wrong pose as well, and only
+    the evidence of what does not repeat itself tells.
+    """
+    return 1.0 / (1.0 + math.exp(-APART * math.log(max(second_ratio, 1e-3))))
 
 
 def is_open(figures: Figures) -> bool:
@@ -148,7 +161,7 @@ def rank_value(score: float, inliers: float, ground: float | None) -> float:
 
 def decide(figures: Figures) -> Verdict:
     """Return the verdict on a best pose."""
-    confidence = probability(figures)
+    confidence = min(probability(figures), told_apart(figures.second_ratio))
     if not figures.converged:
         confidence = min(confidence, 0.5)
         reason = "refused: the refinement on the points left the place that the search had found"
@@ -160,7 +173,7 @@ def decide(figures: Figures) -> Verdict:
             f"to rely on (at least {LEAST_EVIDENCE:.0f} are needed)"
         )
         return Verdict(False, confidence, reason)
-    if confidence >= ACCEPT_AT and figures.decoy_ratio > 1.0 and figures.second_ratio > 1.0:
+    if confidence >= ACCEPT_AT and figures.decoy_ratio > 1.0:
         return Verdict(
             True,
             confidence,
@@ -173,7 +186,7 @@ def decide(figures: Figures) -> Verdict:
 
 def _weakness(figures: Figures) -> str:
     """Return the clause that names what speaks most against the pose."""
-    if figures.second_ratio < 1.15:
+    if told_apart(figures.second_ratio) < ACCEPT_AT:
         return (
             "another pose is nearly as good as the best one (evidence ratio "
             f"{figures.second_ratio:.2f}); the place repeats itself or the maps do not overlap"
