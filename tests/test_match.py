@@ -15,7 +15,7 @@ from commonmap.errors import EmptyMapError, InputError
 from commonmap.matching.decide import Figures, decide, features, is_open, told_apart
 from commonmap.matching.match import match
 from commonmap.types import Cloud, Float64s, Leaves, Match
-from matching_scenes import apart, look, make_place, moved, rigid
+from matching_scenes import Place, apart, look, make_place, moved, rigid
 
 UTM = np.array([470_641.0, 3_810_235.0, 2_278.0])
 
@@ -233,6 +233,24 @@ def test_progress_names_the_steps() -> None:
     steps = list(dict.fromkeys(told))
     assert steps[0] == "prepare the maps"
     assert {"search", "search the mirrored map", "refine", "decide"} <= set(steps)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_row_of_equal_yards_is_ambiguous_and_says_so(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    yard = make_place(seed, 14.0, n_boxes=3, n_posts=4)
+    shifts = 14.0 * np.arange(-2, 3)
+    boxes, posts = (
+        np.vstack([things + np.eye(1, things.shape[1]) * shift for shift in shifts])
+        for things in (yard.boxes, yard.posts)
+    )
+    row = Place(boxes, posts, 0.0, 70.0)
+    draft = look(row, rng, roofs=False, edge=26.0, centre=(0.0, 0.0))
+    answer = match(look(row, rng), draft)
+    assert not answer.accepted
+    assert answer.confidence < 0.8
+    assert "another pose is nearly as good" in answer.reason
+    assert len(answer.rivals) > 1
 
 
 # The verdict: behaviour whatever the weights -----------------------------------------------------
