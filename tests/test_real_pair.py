@@ -92,15 +92,18 @@ def test_a_crop_of_ten_metres_is_placed(drone: Float64s, robot: Float64s, seed: 
     assert degrees < 2.0
 
 
-@pytest.mark.parametrize("seed", [20, 21, 22])
-def test_a_crop_is_placed_from_what_lies_under_one_metre(
-    drone: Float64s, robot: Float64s, seed: int
-) -> None:
-    source, truth = displaced(crop(robot, seed, 16.0), seed)
+def test_crops_are_placed_from_what_lies_under_one_metre(drone: Float64s, robot: Float64s) -> None:
     config = Config().with_values(grid={"max_height": 1.0})
-    metres, degrees = error_of(match(drone, source, config=config), truth, source)
-    assert metres < 0.5
-    assert degrees < 2.0
+    accepted = 0
+    for seed in range(20, 32):
+        source, truth = displaced(crop(robot, seed, 16.0), seed)
+        answer = match(drone, source, config=config)
+        if answer.accepted:
+            metres, degrees = error_of(answer, truth, source)
+            assert metres < 0.5, seed
+            assert degrees < 2.0, seed
+            accepted += 1
+    assert accepted >= 11
 
 
 def test_a_forest_is_not_found_in_a_city(robot: Float64s) -> None:
