@@ -37,8 +37,10 @@ from commonmap.matching.decide import (
     QUICK_WEIGHTS,
     WEIGHTS,
     Figures,
+    at_first_look,
     decide,
     features,
+    is_open,
 )
 from commonmap.matching.match import match
 from commonmap.sim.pairs import simulate_pair
@@ -186,9 +188,7 @@ def figures_of(record: dict[str, Any]) -> Figures:
 
 def as_seen(figures: Figures) -> Figures:
     """Return the figures that `match` looks at: all of them only where the verdict is open."""
-    if verify.is_open(figures):
-        return figures
-    return replace(figures, half_1=None, half_2=None, second_ground=None)
+    return figures if is_open(figures) else at_first_look(figures)
 
 
 def fit() -> None:

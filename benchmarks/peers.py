@@ -159,6 +159,11 @@ def is_within(record: Record, limits: tuple[float, float]) -> bool:
     return record.get("metres", np.inf) <= limits[0] and record.get("degrees", np.inf) <= limits[1]
 
 
+def is_right(record: Record) -> bool:
+    """Return whether an answer was accepted and is right."""
+    return bool(record["accepted"]) and is_within(record, RIGHT)
+
+
 def is_wrong(record: Record) -> bool:
     """Return whether an answer was accepted that is not right."""
     return bool(record["accepted"]) and not is_within(record, RIGHT)
@@ -176,7 +181,7 @@ def overall_table(peers: dict[str, list[Record]]) -> list[str]:
         other = [r for r in rows if r["label"] == "other"]
         timed = [r["cpu_s"] for r in match + other if "cpu_s" in r]
         found = [sum(is_within(r, limits) for r in match) for limits in WITHIN.values()]
-        right = sum(r["accepted"] and is_within(r, RIGHT) for r in match)
+        right = sum(map(is_right, match))
         cells = [
             PEERS[name].title, *(f"{n} of {len(match)}" for n in found), str(right),
             str(sum(is_wrong(r) for r in match)),
@@ -210,7 +215,7 @@ def _family_cell(rows: list[Record]) -> str:
     timed = [r["cpu_s"] for r in rows if "cpu_s" in r]
     time = f"{statistics.median(timed):.1f} s" if timed else "-"
     found = sum(is_within(r, RIGHT) for r in match)
-    right = sum(r["accepted"] and is_within(r, RIGHT) for r in match)
+    right = sum(map(is_right, match))
     wrong = sum(map(is_wrong, rows))
     return f"{found}/{len(match)}, {wrong} wrong, {time} ({_per_right(timed, right)})"
 

@@ -7,7 +7,7 @@ held-out areas lie measurably better with it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,10 +30,7 @@ from commonmap.matching.drift import (
     smooth,
 )
 from commonmap.matching.figures import (
-    lift_mirrored,
     measure_figures,
-    measure_inliers,
-    mirror,
     other_poses,
 )
 from commonmap.matching.maps import (
@@ -48,7 +45,7 @@ from commonmap.matching.maps import (
 from commonmap.matching.refine import lift, refine
 from commonmap.matching.search import Peaks, search
 from commonmap.matching.slabs import SlabGrid
-from commonmap.matching.verify import ground_misfit
+from commonmap.matching.verify import look_at, look_mirrored, with_looks
 from commonmap.types import (
     Area,
     Areas,
@@ -201,22 +198,11 @@ def _match_alone(
     T = lift(found.T_target_source(), base.ground, draft.ground)
     refined = refine(there.xyz, own.xyz, T, cell=max(cell, found.cell), n_most=16_000)
     part = Layers(layers[1].grid, slabs)
-    figures = replace(
+    figures = with_looks(
         measure_figures(layers[0], part, found, found, decoy, refined, cell),
-        inliers=measure_inliers(there, own, refined.T_target_source, cell),
-        ground=ground_misfit(base, own, refined.T_target_source),
+        look_at(base, there, own, refined, cell),
+        look_mirrored(base, lambda placed: there, own, decoy, cell),
     )
-    if len(decoy.score):
-        mirrored = mirror(own, decoy)
-        T_mirrored = lift_mirrored(decoy.T_target_source(), base, mirrored)
-        chance = refine(
-            there.xyz, mirrored.xyz, T_mirrored, cell=max(cell, decoy.cell), settle=False
-        ).T_target_source
-        figures = replace(
-            figures,
-            decoy_inliers=measure_inliers(there, mirrored, chance, cell),
-            decoy_ground=ground_misfit(base, mirrored, T_mirrored),
-        )
     return Alone(found, refined.T_target_source, decide(figures))
 
 

@@ -131,8 +131,7 @@ def probability(figures: Figures) -> float:
     """Return the probability, 0 to 1, that the pose is right."""
     x = features(figures)
     weights = WEIGHTS if "better_half" in x else QUICK_WEIGHTS
-    logit = sum(weights[name] * x[name] for name in weights)
-    return 1.0 / (1.0 + math.exp(-max(-40.0, min(40.0, logit))))
+    return _logistic(max(-40.0, min(40.0, sum(weights[name] * x[name] for name in weights))))
 
 
 def told_apart(second_ratio: float) -> float:
@@ -141,13 +140,17 @@ def told_apart(second_ratio: float) -> float:
     Where a place repeats itself the points lie on each other at the wrong pose as well, and only
     the evidence of what does not repeat itself tells.
     """
-    return 1.0 / (1.0 + math.exp(-APART * math.log(max(second_ratio, 1e-3))))
+    return _logistic(APART * math.log(max(second_ratio, 1e-3)))
+
+
+def at_first_look(figures: Figures) -> Figures:
+    """Return the figures without those of the closer look."""
+    return replace(figures, half_1=None, half_2=None, second_ground=None)
 
 
 def is_open(figures: Figures) -> bool:
-    """Return whether the figures without the halves and the second look leave the verdict open."""
-    quick = replace(figures, half_1=None, half_2=None, second_ground=None)
-    return OPEN[0] < probability(quick) < OPEN[1]
+    """Return whether the figures at first look leave the verdict open."""
+    return OPEN[0] < probability(at_first_look(figures)) < OPEN[1]
 
 
 def rank_value(score: float, inliers: float, ground: float | None) -> float:
@@ -225,6 +228,10 @@ def _weakness(figures: Figures) -> str:
 def _log(ratio: float) -> float:
     """Return the logarithm of a ratio between 1/4 and 20."""
     return math.log(min(max(ratio, 0.25), 20.0))
+
+
+def _logistic(logit: float) -> float:
+    return 1.0 / (1.0 + math.exp(-logit))
 
 
 def _odds(share: float) -> float:

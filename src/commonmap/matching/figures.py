@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from commonmap.frames import apply
 from commonmap.mapping.points import sample
@@ -71,6 +72,11 @@ def other_poses(peaks: Peaks, pose: Float64s, cell: float) -> Bools:
     away = np.hypot(delta[:, 0], delta[:, 1]) > max(3.0, 5.0 * cell)
     turned = np.abs((delta[:, 2] + np.pi) % (2.0 * np.pi) - np.pi) > math.radians(10.0)
     return np.asarray(away | turned)
+
+
+def ranks_elsewhere(peaks: Peaks, cell: float) -> NDArray[np.int64]:
+    """Return the ranks, best first, of the peaks elsewhere than the one of rank 0."""
+    return np.nonzero(other_poses(peaks, peaks.pose[0], cell))[0]
 
 
 def measure_inliers(base: Points, draft: Points, T_target_source: Float64s, cell: float) -> float:

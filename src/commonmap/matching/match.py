@@ -14,7 +14,7 @@ from commonmap.errors import EmptyMapError, InputError
 from commonmap.frames import apply, invert
 from commonmap.matching.decide import NOTHING, Figures, Verdict, decide
 from commonmap.matching.evidence_fft import evidence_surface, transform_target
-from commonmap.matching.figures import other_poses
+from commonmap.matching.figures import ranks_elsewhere
 from commonmap.matching.maps import (
     Layers,
     Prepared,
@@ -175,7 +175,7 @@ def _answer(
     n_found = len(found.score)
     others: list[Candidate] = []
     if n_found:
-        elsewhere = np.nonzero(other_poses(found, found.pose[0], found.cell))[0]
+        elsewhere = ranks_elsewhere(found, found.cell)
         others = [candidate(int(rank)) for rank in elsewhere[: config.search.n_rivals]]
     T, covariance, centre = None, None, None
     if refined is not None:

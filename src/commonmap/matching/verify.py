@@ -16,7 +16,7 @@ from commonmap.matching.figures import (
     measure_figures,
     measure_inliers,
     mirror,
-    other_poses,
+    ranks_elsewhere,
 )
 from commonmap.matching.halves import measure_halves
 from commonmap.matching.maps import (
@@ -100,18 +100,13 @@ def verify(
     if on_evidence:
         found = _choose(maps, points, found, workers)
     look, chance = both(
-        lambda: _look(maps, points, found, 0), lambda: _look_mirrored(maps, points, decoy)
+        lambda: _look(maps, points, found, 0),
+        lambda: look_mirrored(maps.base, maps.points_near, points, decoy, maps.cell),
     )
     figures = measure_figures(
         maps.base_layers, maps.draft_layers, found, witness, decoy, look.refined, maps.cell
     )
-    figures = replace(
-        figures,
-        inliers=look.inliers,
-        ground=look.ground,
-        decoy_inliers=0.0 if chance is None else chance.inliers,
-        decoy_ground=None if chance is None else chance.ground,
-    )
+    figures = with_looks(figures, look, chance)
     if is_open(figures):
         figures = _look_closer(maps, points, found, figures, workers)
     return found, look.refined, figures
@@ -121,7 +116,7 @@ def _look_closer(
     maps: Maps, points: Points, found: Peaks, figures: Figures, workers: int
 ) -> Figures:
     """Return the figures with what settles a doubt: the overlap's halves, the ground elsewhere."""
-    elsewhere = np.nonzero(other_poses(found, found.pose[0], maps.cell))[0]
+    elsewhere = ranks_elsewhere(found, maps.cell)
     halves, second = both(
         lambda: measure_halves(
             maps.base_layers.slabs, maps.draft_layers.slabs, found, maps.cell, workers=workers
@@ -137,8 +132,8 @@ def _look_closer(
 
 def _choose(maps: Maps, points: Points, found: Peaks, workers: int) -> Peaks:
     """Return the peaks with the one first that evidence and points together speak for most."""
-    others = np.nonzero(other_poses(found, found.pose[0], maps.cell))[0]
-    close = [int(n) for n in others if found.score[n] >= CLOSE * found.score[0]]
+    elsewhere = ranks_elsewhere(found, maps.cell)
+    close = [int(n) for n in elsewhere if found.score[n] >= CLOSE * found.score[0]]
     if not close:
         return found
     ranks = [0, *close[: MOST_RIVALS - 1]]
@@ -160,29 +155,44 @@ def _look(maps: Maps, points: Points, found: Peaks, rank: int, *, quick: bool = 
     T = lift(found.T_target_source(rank), maps.base.ground, maps.draft.ground)
     there = maps.points_near(move(T, points.xyz))
     cell = max(maps.cell, found.cell)
-    if quick:
-        refined = refine(there.xyz, points.xyz, T, cell=cell, settle=False)
-    else:
-        refined = refine(there.xyz, points.xyz, T, cell=cell)
+    refined = refine(there.xyz, points.xyz, T, cell=cell, settle=not quick)
+    return look_at(maps.base, there, points, refined, maps.cell)
+
+
+def look_at(base: Prepared, there: Points, points: Points, refined: Refined, cell: float) -> Look:
+    """Return how the draft's points lie on those of the base `there`, at a refined pose."""
     T = refined.T_target_source
-    return Look(
-        refined, measure_inliers(there, points, T, maps.cell), ground_misfit(maps.base, points, T)
-    )
+    return Look(refined, measure_inliers(there, points, T, cell), ground_misfit(base, points, T))
 
 
-def _look_mirrored(maps: Maps, points: Points, decoy: Peaks) -> Look | None:
-    """Return the same of the mirrored source's best pose: what chance makes of points."""
+def look_mirrored(
+    base: Prepared, near: Callable[[Float64s], Points], points: Points, decoy: Peaks, cell: float
+) -> Look | None:
+    """Return the same of the mirrored draft's best pose: what chance makes of points.
+
+    near: returns the base's points about (N, 3) placed points. None where the decoy found no pose.
+    """
     if len(decoy.score) == 0:
         return None
     mirrored = mirror(points, decoy)
-    T = lift_mirrored(decoy.T_target_source(), maps.base, mirrored)
-    there = maps.points_near(move(T, mirrored.xyz))
-    cell = max(maps.cell, decoy.cell)
-    refined = refine(there.xyz, mirrored.xyz, T, cell=cell, settle=False)
+    T = lift_mirrored(decoy.T_target_source(), base, mirrored)
+    there = near(move(T, mirrored.xyz))
+    refined = refine(there.xyz, mirrored.xyz, T, cell=max(cell, decoy.cell), settle=False)
     return Look(
         refined,
-        measure_inliers(there, mirrored, refined.T_target_source, maps.cell),
-        ground_misfit(maps.base, mirrored, T),
+        measure_inliers(there, mirrored, refined.T_target_source, cell),
+        ground_misfit(base, mirrored, T),
+    )
+
+
+def with_looks(figures: Figures, look: Look, chance: Look | None) -> Figures:
+    """Return the figures with what the points say, at the pose and at the mirrored draft's."""
+    return replace(
+        figures,
+        inliers=look.inliers,
+        ground=look.ground,
+        decoy_inliers=0.0 if chance is None else chance.inliers,
+        decoy_ground=None if chance is None else chance.ground,
     )
 
 
