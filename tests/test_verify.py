@@ -27,7 +27,7 @@ def test_the_same_hills_fit_and_shifted_ones_do_not() -> None:
     off = Config().with_values(level={"mode": "off"})
     base = prepare(hills(rng), "target", off)
     xyz = hills(rng, lift=3.0)
-    points = Points(xyz, np.zeros(len(xyz)), np.zeros(len(xyz), bool))
+    points = Points(xyz, np.zeros(len(xyz)), np.zeros(len(xyz), bool), 0.1)
     here = base.T_prepared_map
     fit = ground_misfit(base, points, here)
     shifted = ground_misfit(base, points, here @ from_xyz_yaw(6.0, 0.0, 0.0, 0.0))

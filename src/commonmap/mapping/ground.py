@@ -17,7 +17,7 @@ import numpy as np
 from scipy import ndimage
 
 from commonmap.errors import EmptyMapError
-from commonmap.mapping.points import bounds, sample
+from commonmap.mapping.points import bounds, sampled
 from commonmap.types import Bools, Float64s
 
 MAX_SLOPE = math.tan(math.radians(38.0))
@@ -42,9 +42,14 @@ class Ground:
     seen: Bools
 
     def height_at(self, xy: Float64s) -> Float64s:
-        """Return the ground's z at (N, 2) positions, bilinear, constant past the outer centres."""
+        """Return the ground's z at (N, 2 or 3) positions, bilinear, constant past outer centres."""
         position = np.asarray(xy, dtype=np.float64)
         return np.asarray(_bilinear(self.z, self.origin, self.cell, position))
+
+    def height_above(self, xyz: Float64s) -> Float64s:
+        """Return the height of (N, 3) points above the ground, (N,) metres."""
+        z = self.height_at(xyz)
+        return np.asarray(np.subtract(xyz[:, 2], z, out=z))
 
 
 def find_ground(xyz: Float64s, *, cell: float | None = None) -> Ground:
@@ -119,52 +124,88 @@ def fill(z: Float64s) -> Float64s:
     known = np.isfinite(z)
     if not known.any():
         return np.zeros_like(z)
-    trend = _fit_plane(z, known)
-    values, weights = [np.where(known, z - trend, 0.0)], [known.astype(np.float64)]
-    while max(values[-1].shape) > 1:
-        value, weight = _halve(values[-1] * weights[-1]), _halve(weights[-1])
-        values.append(np.divide(value, weight, out=np.zeros_like(value), where=weight > 0))
-        weights.append(np.minimum(weight, 1.0))
-    filled = values[-1]
-    for value, weight in zip(values[-2::-1], weights[-2::-1], strict=True):
-        coarse = _double(filled, value.shape)
-        filled = weight * value + (1.0 - weight) * coarse
-    return np.where(known, z, filled + trend)
+    return np.asarray(_push_and_pull(np.ascontiguousarray(z), *_fit_plane(z, known)))
 
 
-def _fit_plane(z: Float64s, known: Bools) -> Float64s:
-    """Return the least-squares plane through the known cells, three times reweighted (Cauchy)."""
-    i, j = np.nonzero(known)
-    middle_i, middle_j = i.mean(), j.mean()
-    few = sample(np.column_stack([i - middle_i, j - middle_j, z[known]]), PLANE_CELLS)
-    A, b = np.column_stack([few[:, :2], np.ones(len(few))]), few[:, 2]
-    w = np.ones(len(few))
+def _fit_plane(z: Float64s, known: Bools) -> tuple[float, float, float]:
+    """Return a, b, c of the plane a i + b j + c through the known cells.
+
+    Least squares over `PLANE_CELLS` of them, three times reweighted (Cauchy).
+    """
+    at = np.flatnonzero(known)
+    if len(at) > PLANE_CELLS:
+        at = at[sampled(len(at), PLANE_CELLS)]
+    ij = np.column_stack(np.unravel_index(at, z.shape)).astype(np.float64)
+    middle = ij.mean(axis=0)
+    A, b = np.column_stack([ij - middle, np.ones(len(at))]), z.ravel()[at]
+    w = np.ones(len(at))
     x: Float64s = np.zeros(3)
     for _ in range(4):
-        N = (A * w[:, None]).T @ A + 1e-9 * len(few) * np.eye(3)
+        N = (A * w[:, None]).T @ A + 1e-9 * len(at) * np.eye(3)
         x = np.asarray(np.linalg.solve(N, (A * w[:, None]).T @ b), dtype=np.float64)
         residual = b - A @ x
         scale = 1.4826 * float(np.median(np.abs(residual))) + 1e-3
         w = 1.0 / (1.0 + (residual / (2.0 * scale)) ** 2)
-    I, J = np.meshgrid(*(np.arange(n, dtype=np.float64) for n in z.shape), indexing="ij")
-    return np.asarray((I - middle_i) * x[0] + (J - middle_j) * x[1] + x[2])
+    return float(x[0]), float(x[1]), float(x[2] - middle @ x[:2])
 
 
-def _halve(a: Float64s) -> Float64s:
-    padded = np.pad(a, [(0, n % 2) for n in a.shape])
-    return np.asarray(padded[::2, ::2] + padded[1::2, ::2] + padded[::2, 1::2] + padded[1::2, 1::2])
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _push_and_pull(z, a, b, c):  # type: ignore[no-untyped-def]
+    """Return z, its NaN cells from a pyramid of means of what it is off the plane a i + b j + c."""
+    off, weight = np.zeros(z.shape), np.zeros(z.shape)
+    for i in range(z.shape[0]):
+        for j in range(z.shape[1]):
+            if not np.isnan(z[i, j]):
+                off[i, j], weight[i, j] = z[i, j] - (a * i + b * j + c), 1.0
+    values, weights = [off], [weight]
+    while max(off.shape) > 1:
+        off, weight = _halve(off, weight)
+        values.append(off)
+        weights.append(weight)
+    for level in range(len(values) - 2, -1, -1):
+        off = _pull(off, values[level], weights[level])
+    filled = z.copy()
+    for i in range(z.shape[0]):
+        for j in range(z.shape[1]):
+            if np.isnan(z[i, j]):
+                filled[i, j] = off[i, j] + (a * i + b * j + c)
+    return filled
 
 
-def _double(a: Float64s, shape: tuple[int, ...]) -> Float64s:
-    """Return `a` bilinearly interpolated to twice its size, cut to `shape`."""
-    for axis, n in enumerate(shape):
-        left = np.concatenate([a.take([0], axis), a.take(range(a.shape[axis] - 1), axis)], axis)
-        right = np.concatenate([a.take(range(1, a.shape[axis]), axis), a.take([-1], axis)], axis)
-        pair = np.stack([0.75 * a + 0.25 * left, 0.75 * a + 0.25 * right], axis=axis + 1)
-        doubled = list(a.shape)
-        doubled[axis] *= 2
-        a = pair.reshape(doubled).take(range(n), axis)
-    return a
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _halve(value, weight):  # type: ignore[no-untyped-def]
+    """Return the weighted mean of every two by two cells, and their weight, at most one."""
+    n_x, n_y = value.shape
+    shape = (n_x + 1) // 2, (n_y + 1) // 2
+    mean, sum_ = np.zeros(shape), np.zeros(shape)
+    for i in range(n_x):
+        for j in range(n_y):
+            mean[i >> 1, j >> 1] += value[i, j] * weight[i, j]
+            sum_[i >> 1, j >> 1] += weight[i, j]
+    for i in range(shape[0]):
+        for j in range(shape[1]):
+            if sum_[i, j] > 0.0:
+                mean[i, j] /= sum_[i, j]
+            sum_[i, j] = min(sum_[i, j], 1.0)
+    return mean, sum_
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _pull(coarse, value, weight):  # type: ignore[no-untyped-def]
+    """Return the values, where they have little weight those of the coarser level, bilinear."""
+    n_x, n_y = coarse.shape
+    out = np.empty(value.shape)
+    for i in range(value.shape[0]):
+        near = i >> 1
+        far = min(near + 1, n_x - 1) if i & 1 else max(near - 1, 0)
+        for j in range(value.shape[1]):
+            k = j >> 1
+            m = min(k + 1, n_y - 1) if j & 1 else max(k - 1, 0)
+            one = 0.75 * coarse[near, k] + 0.25 * coarse[far, k]
+            other = 0.75 * coarse[near, m] + 0.25 * coarse[far, m]
+            w = weight[i, j]
+            out[i, j] = w * value[i, j] + (1.0 - w) * (0.75 * one + 0.25 * other)
+    return out
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]

@@ -97,7 +97,7 @@ def build_height_map(
         raise InputError("slab_edges must be 2 to 33 rising heights in metres")
     ground = ground or find_ground(xyz)
     if height is None:
-        height = xyz[:, 2] - ground.height_at(xyz[:, :2])
+        height = ground.height_above(xyz)
     limit = np.inf if max_height is None else max_height
     found = _find_columns(np.ascontiguousarray(xyz), height, limit, cell)
     if found is None:

@@ -14,10 +14,11 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from commonmap.frames import apply, from_rotation, rotation_between
 from commonmap.mapping.ground import find_ground
-from commonmap.mapping.points import bounds, first_of_voxels, move, sample
+from commonmap.mapping.points import first_of_voxels, move, rows_of, sample
 from commonmap.types import Float64s
 
 MAX_SIGMA = math.radians(2.0)
@@ -28,6 +29,13 @@ FINEST_STEP = math.radians(0.5)
 
 MOST_POINTS = 600_000
 """Points that are looked at, at even steps through the cloud."""
+
+MOST_COARSE = 15_000
+"""Points above ground that are looked at while the plan's cells are still wide."""
+
+ASKEW = from_rotation(Rotation.from_euler("xyz", [0.5, 0.6, 0.7]).as_matrix())
+"""How the voxels lie of which one point each is looked at: rows of them that stand on the plan's
+cells would share these along the map's own z alone, wherever up is."""
 
 PRIOR_TILT = math.radians(1.5)
 """How far from level a map is expected to be that says it is (standard deviation)."""
@@ -95,10 +103,10 @@ def find_level(xyz: Float64s) -> Levelling:
 def _standing(xyz: Float64s) -> Float64s:
     """Return one point per voxel of what stands over half a metre above ground, at most 60,000."""
     ground = find_ground(xyz)
-    above = xyz[xyz[:, 2] - ground.height_at(xyz[:, :2]) > 0.5]
+    above = rows_of(xyz, ground.height_above(xyz) > 0.5)
     if len(above) == 0:
         return above
-    thin = above[first_of_voxels(above - bounds(above)[0], 0.1)]
+    thin = above[first_of_voxels(move(ASKEW, above), 0.1)]
     return np.ascontiguousarray(thin[:: len(thin) // 60_000 + 1])
 
 
@@ -107,8 +115,10 @@ def _sharpest(
 ) -> tuple[float, float]:
     """Return the tilts (a, b) in radians of the line of sight of the sharpest plan.
 
-    peak_only: return NaN where the sharpest lies on the border of what was looked at.
+    peak_only: return NaN where the sharpest lies on the border of what was looked at. On wide cells
+    `MOST_COARSE` of the points tell where it is; all of them do on the finest.
     """
+    some = np.ascontiguousarray(sample(xyz, MOST_COARSE))
     height = max(float(np.ptp(np.quantile(sample(xyz, 10_000)[:, 2], [0.05, 0.95]))), 1.0)
     cell = max(0.6, width * height / 16.0)
     finest = max(0.1, math.radians(0.2) * height)
@@ -116,7 +126,7 @@ def _sharpest(
         n_side = 2 * min(8, max(2, math.ceil(width * height / cell))) + 1
         steps = np.linspace(-width, width, n_side)
         step = float(steps[1] - steps[0])
-        score = _shared_pairs(xyz, a + steps, b + steps, cell)
+        score = _shared_pairs(xyz if cell <= finest else some, a + steps, b + steps, cell)
         i, j = np.unravel_index(int(np.argmax(score)), score.shape)
         if peak_only and (min(i, j) == 0 or max(i, j) == n_side - 1):
             return math.nan, math.nan  # no peak within reach, only a trend
@@ -146,7 +156,7 @@ def _top_of(steps: Float64s, score: Float64s) -> tuple[float, float]:
 
 def _scatter_of_parts(xyz: Float64s, a: float, b: float) -> float:
     """Return the standard error in radians of (a, b), from what each part of the map says alone."""
-    low, high = np.quantile(xyz[:, :2], [0.02, 0.98], axis=0)
+    low, high = np.quantile(sample(xyz, 10_000)[:, :2], [0.02, 0.98], axis=0)
     size = float((high - low).max()) / 4.0
     ij = np.floor((xyz[:, :2] - low) / max(size, 1e-6)).astype(np.int64)
     part = ij[:, 0] * 64 + ij[:, 1]
@@ -217,8 +227,8 @@ def _rough_up(xyz: Float64s) -> tuple[Float64s, bool]:
 
     The map's own z stays unless another direction has twice as much of it.
     """
-    points = np.ascontiguousarray(xyz[:: len(xyz) // 300_000 + 1])
-    low, high = np.quantile(points, [0.01, 0.99], axis=0)
+    points = sample(xyz, 100_000)
+    low, high = np.quantile(sample(points, 10_000), [0.01, 0.99], axis=0)
     size = max(float((high - low).max()) / 40.0, 0.25)
     own = np.array([0.0, 0.0, 1.0])
     own_share = _smooth_share(points, np.eye(3), size)

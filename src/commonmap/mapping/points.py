@@ -70,6 +70,25 @@ def inside_box(points: Float64s, low: Float64s, high: Float64s) -> Bools:
     return inside
 
 
+def rows_of(xyz: Float64s, wanted: Bools) -> Float64s:
+    """Return the wanted ones, (N,) bool, of (N, 3) points, in half of numpy's time."""
+    return np.asarray(_rows_of(np.ascontiguousarray(xyz, dtype=np.float64), wanted))
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _rows_of(xyz, wanted):  # type: ignore[no-untyped-def]
+    n = 0
+    for k in range(wanted.shape[0]):
+        n += wanted[k]
+    out, n = np.empty((n, 3)), 0
+    for k in range(wanted.shape[0]):
+        if wanted[k]:
+            for a in range(3):
+                out[n, a] = xyz[k, a]
+            n += 1
+    return out
+
+
 def sample(xyz: Float64s, n_most: int) -> Float64s:
     """Return at most `n_most` of the points, one from each of as many equal runs of them.
 
@@ -77,6 +96,12 @@ def sample(xyz: Float64s, n_most: int) -> Float64s:
     same rings of a spinning lidar over and over.
     """
     return xyz if len(xyz) <= n_most else xyz[sampled(len(xyz), n_most)]
+
+
+def sample_where(xyz: Float64s, wanted: Bools, n_most: int) -> Float64s:
+    """Return what `sample` takes of the wanted points, (N,) bool."""
+    which = np.flatnonzero(wanted)
+    return xyz[which if len(which) <= n_most else which[sampled(len(which), n_most)]]
 
 
 def sampled(n: int, n_most: int) -> NDArray[np.int64]:
@@ -128,20 +153,42 @@ def thin(xyz: Float64s, voxel: float, n_most: int | None = None) -> Float64s:
 
 def first_of_voxels(xyz: Float64s, voxel: float) -> NDArray[np.int64]:
     """Return the index of the first point of every voxel of a width in metres, rising."""
-    order, starts = _group(xyz, voxel)
-    return np.sort(order[starts[:-1]]).astype(np.int64)
+    return np.asarray(_first_of_keys(_keys(np.ascontiguousarray(xyz), voxel)))
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _first_of_keys(key):  # type: ignore[no-untyped-def]
+    """Return where each of the values, 0 and up, comes first, rising: by a table of them."""
+    size = 64
+    while size < 2 * key.shape[0]:
+        size *= 2
+    met = np.full(size, -1, np.int64)
+    found, n = np.empty(key.shape[0], np.int64), 0
+    for k in range(key.shape[0]):
+        mixed = np.uint64(key[k]) * np.uint64(0x9E3779B97F4A7C15)
+        place = np.int64(mixed >> np.uint64(32)) & (size - 1)
+        while met[place] != -1 and met[place] != key[k]:
+            place = (place + 1) & (size - 1)
+        if met[place] == -1:
+            met[place] = key[k]
+            found[n] = k
+            n += 1
+    return found[:n].copy()
 
 
 def _group(xyz: Float64s, voxel: float) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """Return the points' order by voxel, and where each voxel starts in it."""
-    xyz, scale = np.ascontiguousarray(xyz), 1.0 / voxel
+    order, key = _sort(_keys(np.ascontiguousarray(xyz), voxel))
+    return order, np.asarray(_starts(key))
+
+
+def _keys(xyz: Float64s, voxel: float) -> NDArray[np.int32] | NDArray[np.int64]:
+    """Return the number of each point's voxel, see `_voxel_keys`."""
+    scale = 1.0 / voxel
     low, high = (np.floor(end * scale) for end in bounds(xyz))
     shape = high - low + 1.0
-    key = _voxel_keys(xyz, scale, low, shape.astype(np.int64))
-    if np.prod(shape) < 2.0**31:
-        key = key.astype(np.int32)  # half the bytes to sort
-    order, key = _sort(key)
-    return order, np.asarray(_starts(key))
+    key: NDArray[np.int64] = _voxel_keys(xyz, scale, low, shape.astype(np.int64))
+    return key.astype(np.int32) if np.prod(shape) < 2.0**31 else key  # half the bytes to sort
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]

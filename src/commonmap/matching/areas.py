@@ -148,7 +148,7 @@ def match_areas(
     area_of = tiling.find(points.xyz)
     for n, ij in enumerate(tiling.ij):
         progress("areas by themselves", n / len(tiling.ij))
-        own = Points(*(part[area_of == n] for part in (points.xyz, points.height, points.standing)))
+        own = points.where(area_of == n)
         alone.append(_match_alone(base, draft, layers, there, own, ij, tiling.size, cell))
 
     # 4. how the draft is bent, told by areas near the pose of the whole: (A, 4)
@@ -196,7 +196,9 @@ def _match_alone(
         return None
     decoy = search(layers[0].slabs, slabs, min_overlap=LEAST_OVERLAP, mirrored=True)
     T = lift(found.T_target_source(), base.ground, draft.ground)
-    refined = refine(there.xyz, own.xyz, T, cell=max(cell, found.cell), n_most=16_000)
+    refined = refine(
+        there.xyz, own.xyz, T, cell=max(cell, found.cell), n_most=16_000, apart=own.voxel
+    )
     part = Layers(layers[1].grid, slabs)
     figures = with_looks(
         measure_figures(layers[0], part, found, found, decoy, refined, cell),

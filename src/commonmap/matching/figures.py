@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from commonmap.frames import apply
-from commonmap.mapping.points import sample
+from commonmap.mapping.points import sample_where
 from commonmap.matching.decide import Figures
 from commonmap.matching.inliers import share_of_inliers
 from commonmap.matching.maps import Layers, Points, Prepared
@@ -17,6 +18,14 @@ from commonmap.matching.search import Peaks, centre_columns, evidence_at
 from commonmap.matching.slabs import coarsen, list_columns
 from commonmap.matching.support import measure_support
 from commonmap.types import Bools, Float64s
+
+CLEAR_BY = 4.0
+"""How many times the score of the mirrored source's best pose, and of the best pose elsewhere, the
+score of a pose must be at a glance. Some other places reach more, but with a tenth of the score."""
+
+CLEAR_FROM = 100.0
+"""Score, nats, that a pose must have at a glance. Of 7,600 drafts of other places those that stood
+four times above chance came to 72 at most (docs/matching.md)."""
 
 
 def measure_figures(
@@ -60,7 +69,7 @@ def measure_figures(
 def lift_mirrored(T_planar: Float64s, base: Prepared, mirrored: Points) -> Float64s:
     """Return the planar motion of the mirrored source with z set by its ground."""
     low = np.abs(mirrored.height) < 0.3
-    moved = apply(T_planar, sample(mirrored.xyz[low] if low.any() else mirrored.xyz, 20_000))
+    moved = apply(T_planar, sample_where(mirrored.xyz, low | ~low.any(), 20_000))
     lifted = T_planar.copy()
     lifted[2, 3] += float(np.median(base.ground.height_at(moved[:, :2]) - moved[:, 2]))
     return lifted
@@ -79,6 +88,15 @@ def ranks_elsewhere(peaks: Peaks, cell: float) -> NDArray[np.int64]:
     return np.nonzero(other_poses(peaks, peaks.pose[0], cell))[0]
 
 
+def is_told_at_a_glance(found: Peaks, decoy: Peaks) -> bool:
+    """Return whether the best pose stands so far above all others that no search has to go on."""
+    if len(found.score) == 0:
+        return False
+    others = found.score[ranks_elsewhere(found, found.cell)], decoy.score
+    chance = max(float(scores.max(initial=0.0)) for scores in others)
+    return bool(found.score[0] >= max(CLEAR_FROM, CLEAR_BY * chance))
+
+
 def measure_inliers(base: Points, draft: Points, T_target_source: Float64s, cell: float) -> float:
     """Return the share of the draft's standing points near standing points of the base."""
     return share_of_inliers(
@@ -90,4 +108,4 @@ def mirror(draft: Points, decoy: Peaks) -> Points:
     """Return the points reflected (x -> -x) about the centre of the source, as the decoy was."""
     xyz = draft.xyz.copy()
     xyz[:, 0] = 2.0 * decoy.centre[0] - xyz[:, 0]
-    return Points(xyz, draft.height, draft.standing)
+    return replace(draft, xyz=xyz)

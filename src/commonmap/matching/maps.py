@@ -13,7 +13,7 @@ from commonmap.mapping.ground import Ground, find_ground
 from commonmap.mapping.height_map import build_height_map, choose_cell, choose_slabs
 from commonmap.mapping.level import MOST_POINTS as LEVEL_POINTS
 from commonmap.mapping.level import Levelling, find_level, no_levelling
-from commonmap.mapping.points import bounds, inside_box, move, points_of, sample, thin
+from commonmap.mapping.points import bounds, inside_box, move, points_of, rows_of, sample, thin
 from commonmap.matching.slabs import SlabGrid, pack_slabs
 from commonmap.metrics.table import METRICS
 from commonmap.types import Bools, Cloud, Float64s, GridMap, Leaves
@@ -49,12 +49,19 @@ class Points:
     """Points for the refinement and the verdict, one mean per small voxel.
 
     xyz: (M, 3) metres. height: (M,) metres above ground. standing: (M,) bool, above the lowest
-    slab edge.
+    slab edge. voxel: metres.
     """
 
     xyz: Float64s
     height: Float64s
     standing: Bools
+    voxel: float
+
+    def where(self, wanted: Bools) -> Points:
+        """Return the wanted ones, (M,) bool."""
+        return Points(
+            rows_of(self.xyz, wanted), self.height[wanted], self.standing[wanted], self.voxel
+        )
 
 
 def prepare(item: Cloud | Leaves | Float64s, name: str, config: Config) -> Prepared:
@@ -81,7 +88,7 @@ def prepare(item: Cloud | Leaves | Float64s, name: str, config: Config) -> Prepa
     T_prepared_map = levelling.T_level_map @ from_rotation(np.eye(3), -middle)
     local = move(T_prepared_map, xyz)
     ground = find_ground(local)
-    height = local[:, 2] - ground.height_at(local[:, :2])
+    height = ground.height_above(local)
     return Prepared(local, T_prepared_map, ground, height, levelling)
 
 
@@ -119,18 +126,18 @@ def choose_points(
     The voxel is a quarter cell or 0.1 m. around: (K, 3) take only what lies within three cells of
     the plan of these points, metres: a large base is not thinned as a whole.
     """
-    xyz = item.xyz if max_height is None else item.xyz[item.height < max_height]
+    xyz = item.xyz if max_height is None else rows_of(item.xyz, item.height < max_height)
     if around is not None:
-        xyz = xyz[_is_around(xyz, around, cell)]
-    xyz = thin(sample(xyz, MOST_POINTS), min(0.25 * cell, 0.1))
-    height = xyz[:, 2] - item.ground.height_at(xyz[:, :2])
-    return Points(xyz, height, height > edges[0])
+        xyz = rows_of(xyz, _is_around(xyz, around, cell))
+    voxel = min(0.25 * cell, 0.1)
+    xyz = thin(sample(xyz, MOST_POINTS), voxel)
+    height = item.ground.height_above(xyz)
+    return Points(xyz, height, height > edges[0], voxel)
 
 
 def points_around(points: Points, around: Float64s, cell: float) -> Points:
     """Return the points within three cells of the plan of (K, 3) points, metres."""
-    inside = _is_around(points.xyz, around, cell)
-    return Points(points.xyz[inside], points.height[inside], points.standing[inside])
+    return points.where(_is_around(points.xyz, around, cell))
 
 
 def _is_around(xyz: Float64s, around: Float64s, cell: float) -> Bools:

@@ -14,7 +14,7 @@ from commonmap.errors import EmptyMapError, InputError
 from commonmap.frames import apply, invert
 from commonmap.matching.decide import NOTHING, Figures, Verdict, decide
 from commonmap.matching.evidence_fft import evidence_surface, transform_target
-from commonmap.matching.figures import ranks_elsewhere
+from commonmap.matching.figures import is_told_at_a_glance, ranks_elsewhere
 from commonmap.matching.maps import (
     Layers,
     Prepared,
@@ -23,7 +23,7 @@ from commonmap.matching.maps import (
     prepare,
 )
 from commonmap.matching.refine import Refined, lift
-from commonmap.matching.search import Peaks, centre_columns, plan_search, search
+from commonmap.matching.search import Peaks, centre_columns, plan_glance, plan_search, search
 from commonmap.matching.search_metric import search_metric
 from commonmap.matching.seen_free import know_by_rays
 from commonmap.matching.slabs import SlabGrid, coarsen, list_columns, scatter
@@ -87,17 +87,14 @@ def match(
             )
 
     # 3. every x, y and yaw; and again with the source mirrored
-    with _timed(timings, "search"):
-        found = _search(base_layers, draft_layers, config, False, progress)
-    with _timed(timings, "decoy"):
-        decoy = _search(base_layers, draft_layers, config, True, progress)
+    found, decoy = _search_both(base_layers, draft_layers, config, timings, progress)
     witness, witness_decoy = found, decoy
     if METRICS[config.search.metric].layers != "slabs":
         # Whatever metric searched, the verdict is on evidence against what chance finds of it
-        with _timed(timings, "witness"):
-            by_evidence = config.with_values(search={"metric": "evidence"})
-            witness = _search(base_layers, draft_layers, by_evidence, False, progress)
-            witness_decoy = _search(base_layers, draft_layers, by_evidence, True, progress)
+        by_evidence = config.with_values(search={"metric": "evidence"})
+        witness, witness_decoy = _search_both(
+            base_layers, draft_layers, by_evidence, timings, progress
+        )
 
     # 4. z in closed form, then all six degrees of freedom on the points, of the best pose, of those
     #    close to it, and of the mirrored source's, which cannot be right
@@ -127,9 +124,30 @@ def least_overlap(config: Config) -> float:
     return 0.1 if METRICS[config.search.metric].layers == "slabs" else 0.5
 
 
+def _search_both(
+    base: Layers, draft: Layers, config: Config, timings: dict[str, float], progress: Progress
+) -> tuple[Peaks, Peaks]:
+    """Return the best poses of the source as it is, and of the mirrored source.
+
+    At a glance where that tells, else of the whole search.
+    """
+    if METRICS[config.search.metric].layers == "slabs":
+        found, decoy = (
+            _search(base, draft, config, mirrored, timings, progress, glance=True)
+            for mirrored in (False, True)
+        )
+        if is_told_at_a_glance(found, decoy):
+            return found, decoy
+    found, decoy = (
+        _search(base, draft, config, mirrored, timings, progress) for mirrored in (False, True)
+    )
+    return found, decoy
+
+
 def _search(
-    base: Layers, draft: Layers, config: Config, mirrored: bool, progress: Progress
-) -> Peaks:
+    base: Layers, draft: Layers, config: Config, mirrored: bool, timings: dict[str, float],
+    progress: Progress, *, glance: bool = False,
+) -> Peaks:  # fmt: skip
     def tell(step: str, share: float = 0.0) -> None:
         progress("search the mirrored map" if mirrored else step, share)
 
@@ -140,16 +158,18 @@ def _search(
             f"{base.grid.slab_edges[0]:.2g} and {base.grid.slab_edges[-1]:.2g} m; "  # type: ignore[index]
             "there is nothing to match"
         )
-    if METRICS[config.search.metric].layers == "slabs":
-        return search(
-            base.slabs, draft.slabs, min_overlap=least_overlap(config), mirrored=mirrored,
-            workers=WORKERS, compute=config.compute, progress=tell,
+    with _timed(timings, "decoy" if mirrored else "search"):
+        if METRICS[config.search.metric].layers == "slabs":
+            plan = (plan_glance if glance else plan_search)(base.slabs, draft.slabs)
+            return search(
+                base.slabs, draft.slabs, min_overlap=least_overlap(config), mirrored=mirrored,
+                plan=plan, workers=WORKERS, compute=config.compute, progress=tell,
+            )  # fmt: skip
+        return search_metric(
+            base.grid, draft.grid, metric=config.search.metric, normalise=config.search.normalise,
+            floor=config.search.floor, min_overlap=least_overlap(config), mirrored=mirrored,
+            arrays=config.compute.arrays, workers=WORKERS, progress=tell,
         )  # fmt: skip
-    return search_metric(
-        base.grid, draft.grid, metric=config.search.metric, normalise=config.search.normalise,
-        floor=config.search.floor, min_overlap=least_overlap(config), mirrored=mirrored,
-        arrays=config.compute.arrays, workers=WORKERS, progress=tell,
-    )  # fmt: skip
 
 
 def _answer(
@@ -252,6 +272,7 @@ def _draw(
 
 @contextmanager
 def _timed(timings: dict[str, float], step: str) -> Iterator[None]:
+    """Add the seconds that the block takes to those of a step."""
     start = time.perf_counter()
     yield
-    timings[step] = time.perf_counter() - start
+    timings[step] = timings.get(step, 0.0) + time.perf_counter() - start

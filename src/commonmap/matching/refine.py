@@ -32,6 +32,16 @@ MOST_SURFACE = 60_000
 WALKED = 0.01
 """A walk is over at steps of less than this share of a cell."""
 
+SETTLED = 5e-4
+"""Metres, of the last step of all: less than points tell, and half as many steps as a fifth of it
+takes."""
+
+STEPS = 8
+"""Steps at most of the first walk, and of the last ones."""
+
+STEPS_BETWEEN = 5
+"""Steps at most of those between: a pose that is right has hardly any left, a wrong one no end."""
+
 
 @dataclass(frozen=True, eq=False)
 class Refined:
@@ -88,13 +98,15 @@ def refine(
     T_target_source: Float64s,
     *,
     cell: float,
+    apart: float = 0.0,
     n_most: int = 40_000,
     settle: bool = True,
 ) -> Refined:
     """Return the pose refined on the points, starting from within about one `cell` of the truth.
 
     target_xyz: (N, 3), source_xyz: (M, 3) metres. cell: metres, of the search. Points are thinned
-    to one per voxel of a third of the cell, or coarser. settle: end on finer points, about `n_most`
+    to one per voxel of a third of the cell, or coarser. apart: metres, the width of voxels of which
+    each holds a point at most, where that is known. settle: end on finer points, about `n_most`
     of the source, and measure the covariance.
     """
     start = np.asarray(T_target_source, dtype=np.float64)
@@ -111,17 +123,22 @@ def refine(
     fine = max(0.05, 0.3 * voxel)
     target, source = target_xyz[inside] - centre, moved_source - centre
     if settle:
-        target, source = thin(target, fine, 2 * n_most), thin(source, fine, n_most)
+        target, source = (
+            thin(xyz, max(fine, apart * math.sqrt(len(xyz) / most)), most)
+            for xyz, most in ((target, 2 * n_most), (source, n_most))
+        )
 
     # Walk from the search's peak with few points, then with more of them
     spacing, T = voxel, np.eye(4)
     surface = _surface(thin(target, voxel, MOST_SURFACE), voxel)
     some = thin(source, voxel, MOST_ARRIVING)
     few = thin(some, cell, MOST_WALKING)
-    for reach in (3.0 * cell, 2.0 * cell, 1.5 * cell):
-        T, pairs = _solve_point_to_plane(surface, few, T, reach=reach, until=WALKED * cell)
-    for reach in (1.5 * cell, 0.75 * cell):
-        T, pairs = _solve_point_to_plane(surface, some, T, reach=reach, until=WALKED * cell)
+    until = WALKED * cell
+    T, _ = _solve_point_to_plane(surface, few, T, reach=3.0 * cell, until=until)
+    for xyz, reach in ((few, 2.0), (few, 1.5), (some, 1.5), (some, 0.75)):
+        T, pairs = _solve_point_to_plane(
+            surface, xyz, T, reach=reach * cell, until=until, most=STEPS_BETWEEN
+        )
 
     # The last centimetres come from the finest points, within reach of what the last step left
     if settle and pairs is not None:
@@ -130,7 +147,7 @@ def refine(
             surface = _surface(target, fine)
         few = sample(source, MOST_ARRIVING)
         T, pairs = _solve_point_to_plane(surface, few, T, reach=reach, until=1e-3)
-        T, pairs = _solve_point_to_plane(surface, source, T, reach=reach)
+        T, pairs = _solve_point_to_plane(surface, source, T, reach=reach, until=SETTLED)
     covariance, rms = np.eye(6), float("inf")
     if pairs is not None:
         rms = pairs.scale
@@ -167,14 +184,16 @@ def _unrefined(start: Float64s, source_xyz: Float64s) -> Refined:
 
 
 def _solve_point_to_plane(
-    surface: Surface, source: Float64s, T: Float64s, *, reach: float, until: float = 1e-4
-) -> tuple[Float64s, Pairs | None]:
+    surface: Surface, source: Float64s, T: Float64s, *, reach: float, until: float,
+    most: int = STEPS,
+) -> tuple[Float64s, Pairs | None]:  # fmt: skip
     """Return (T, its pairs) after robust Gauss-Newton steps on point-to-plane residuals.
 
-    until: metres, of the last step. The pairs are None where too few points are within reach.
+    until: metres, of the last step. most: how many steps at most. The pairs are None where too few
+    points are within reach.
     """
     T = T.copy()
-    for _ in range(8):
+    for _ in range(most):
         pairs = pair_points(surface, source, T, reach=reach)
         if pairs is None:
             return T, None

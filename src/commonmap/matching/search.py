@@ -30,6 +30,15 @@ from commonmap.matching.tiles import (
 )
 from commonmap.types import Float64s, Progress, no_progress
 
+BUDGET = 1e8
+"""Padded cells times yaws times layers, of the exhaustive part of a search."""
+
+KEEP = 256
+"""Poses of the exhaustive part that climb."""
+
+GLANCE = 1.0 / 8.0
+"""Share of `BUDGET` and of `KEEP` that a glance takes: cells twice as wide, yaws half as many."""
+
 CLOSE = 0.64
 """Peaks with at least this share of the best evidence climb from everywhere about them."""
 
@@ -62,7 +71,7 @@ class Peaks:
         return np.asarray(from_xyz_yaw(x, y, 0.0, yaw) @ shift)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class SearchPlan:
     """What the search will do, derived from the two maps. cells: coarse to fine, metres."""
 
@@ -71,11 +80,14 @@ class SearchPlan:
     keep: tuple[int, ...]
 
 
-def plan_search(target: SlabGrid, source: SlabGrid, *, budget: float = 1e8) -> SearchPlan:
+def plan_search(
+    target: SlabGrid, source: SlabGrid, *, budget: float = BUDGET, keep: int = KEEP
+) -> SearchPlan:
     """Return the pyramid of cells and the number of yaws for two grids of half the finest cell.
 
     The coarsest cell is the finest one that keeps the exhaustive part within `budget` (padded
-    cells times yaws times layers), and leaves at least 16 cells along the source.
+    cells times yaws times layers), and leaves at least 16 cells along the source. keep: poses that
+    climb on it; on every finer one a quarter of these, but at least a tenth of `keep`.
     """
     columns = list_columns(source)
     radius = _radius(columns)
@@ -88,8 +100,13 @@ def plan_search(target: SlabGrid, source: SlabGrid, *, budget: float = 1e8) -> S
         if cost <= budget or 2.0 * radius / (2.0 * cells[0]) < 16:
             break
         cells.insert(0, 2.0 * cells[0])
-    keep = tuple(max(24, 256 >> (2 * level)) for level in range(len(cells)))
-    return SearchPlan(tuple(cells), n_yaw, keep)
+    climbing = tuple(max(3 * keep // 32, keep >> (2 * level)) for level in range(len(cells)))
+    return SearchPlan(tuple(cells), n_yaw, climbing)
+
+
+def plan_glance(target: SlabGrid, source: SlabGrid) -> SearchPlan:
+    """Return the plan of a search that tells most maps which match, and no more."""
+    return plan_search(target, source, budget=GLANCE * BUDGET, keep=round(GLANCE * KEEP))
 
 
 def search(

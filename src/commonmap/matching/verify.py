@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from commonmap.mapping.points import move, sample
+from commonmap.mapping.points import move, sample_where
 from commonmap.matching.decide import Figures, is_open, rank_value
 from commonmap.matching.figures import (
     lift_mirrored,
@@ -155,7 +155,7 @@ def _look(maps: Maps, points: Points, found: Peaks, rank: int, *, quick: bool = 
     T = lift(found.T_target_source(rank), maps.base.ground, maps.draft.ground)
     there = maps.points_near(move(T, points.xyz))
     cell = max(maps.cell, found.cell)
-    refined = refine(there.xyz, points.xyz, T, cell=cell, settle=not quick)
+    refined = refine(there.xyz, points.xyz, T, cell=cell, apart=points.voxel, settle=not quick)
     return look_at(maps.base, there, points, refined, maps.cell)
 
 
@@ -177,7 +177,9 @@ def look_mirrored(
     mirrored = mirror(points, decoy)
     T = lift_mirrored(decoy.T_target_source(), base, mirrored)
     there = near(move(T, mirrored.xyz))
-    refined = refine(there.xyz, mirrored.xyz, T, cell=max(cell, decoy.cell), settle=False)
+    refined = refine(there.xyz, mirrored.xyz, T, cell=max(cell, decoy.cell), apart=points.voxel,
+        settle=False,
+    )  # fmt: skip
     return Look(
         refined,
         measure_inliers(there, mirrored, refined.T_target_source, cell),
@@ -203,7 +205,7 @@ def ground_misfit(base: Prepared, points: Points, T_target_source: Float64s) -> 
     base measured; a constant step between the two does not count. None where fewer than 50 points
     tell.
     """
-    low = sample(points.xyz[np.abs(points.height) < LOW], 20_000)
+    low = sample_where(points.xyz, np.abs(points.height) < LOW, 20_000)
     placed = move(T_target_source, low)
     ground = base.ground
     ij = np.floor((placed[:, :2] - ground.origin) / ground.cell).astype(np.int64)

@@ -257,7 +257,7 @@ def _place(
     """Return the flat cell index (N,) and the height above ground (N,) of points."""
     ij = np.floor((xyz[:, :2] - origin) / cell).astype(np.int64)
     ij = np.minimum(ij, np.array(shape) - 1)
-    return ij[:, 0] * shape[1] + ij[:, 1], xyz[:, 2] - ground.height_at(xyz[:, :2])
+    return ij[:, 0] * shape[1] + ij[:, 1], ground.height_above(xyz)
 
 
 def _any(index: NDArray[np.int64], shape: tuple[int, int]) -> Bools:

@@ -123,7 +123,7 @@ def _show(xyz: Float64s, T_target_map: Float64s | None, bit: int) -> Shown:
     few = xyz[take_evenly(len(xyz), 8 * MAX_POINTS)]
     ground = find_ground(few)
     kept = few[thin(few, MAX_POINTS)]
-    height = np.maximum(kept[:, 2] - ground.height_at(kept[:, :2]), 0.0)
+    height = np.maximum(ground.height_above(kept), 0.0)
     moved = kept if T_target_map is None else apply(T_target_map, kept)
     return Shown(moved, height, np.full(len(kept), bit, np.uint8))
 

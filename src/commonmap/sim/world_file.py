@@ -115,7 +115,7 @@ def world_of_cloud(xyz: Float64s, *, size: float | None = None, name: str = "clo
     ground = Ground(ground.origin, ground.cell, ground.z - np.median(ground.z), ground.seen)
     n = int(np.ceil(2.0 * reach / cell))
     index = np.minimum(np.floor((local[:, :2] + reach) / cell).astype(int), n - 1)
-    above = local[:, 2] - ground.height_at(local[:, :2])
+    above = ground.height_above(local)
     top = np.zeros((n, n))
     np.maximum.at(top, (index[:, 0], index[:, 1]), above)
     beside = np.ones((3, 3), bool)
