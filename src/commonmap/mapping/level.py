@@ -14,11 +14,10 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from commonmap.frames import apply, from_rotation, rotation_between
 from commonmap.mapping.ground import find_ground
-from commonmap.mapping.points import first_of_voxels, move, rows_of, sample
+from commonmap.mapping.points import bounds, first_of_voxels, move, rows_of, sample
 from commonmap.types import Float64s
 
 MAX_SIGMA = math.radians(2.0)
@@ -32,10 +31,6 @@ MOST_POINTS = 600_000
 
 MOST_COARSE = 15_000
 """Points above ground that are looked at while the plan's cells are still wide."""
-
-ASKEW = from_rotation(Rotation.from_euler("xyz", [0.5, 0.6, 0.7]).as_matrix())
-"""How the voxels lie of which one point each is looked at: rows of them that stand on the plan's
-cells would share these along the map's own z alone, wherever up is."""
 
 PRIOR_TILT = math.radians(1.5)
 """How far from level a map is expected to be that says it is (standard deviation)."""
@@ -106,7 +101,8 @@ def _standing(xyz: Float64s) -> Float64s:
     above = rows_of(xyz, ground.height_above(xyz) > 0.5)
     if len(above) == 0:
         return above
-    thin = above[first_of_voxels(move(ASKEW, above), 0.1)]
+    # voxels that lay on the plan's own cells would favour the map's own z
+    thin = above[first_of_voxels(above - bounds(above)[0], 0.1)]
     return np.ascontiguousarray(thin[:: len(thin) // 60_000 + 1])
 
 

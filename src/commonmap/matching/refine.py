@@ -135,9 +135,10 @@ def refine(
     few = thin(some, cell, MOST_WALKING)
     until = WALKED * cell
     T, _ = _solve_point_to_plane(surface, few, T, reach=3.0 * cell, until=until)
-    for xyz, reach in ((few, 2.0), (few, 1.5), (some, 1.5), (some, 0.75)):
+    for xyz, cells in ((few, 2.0), (few, 1.5), (some, 1.5), (some, 0.75)):
+        reach = cells * cell
         T, pairs = _solve_point_to_plane(
-            surface, xyz, T, reach=reach * cell, until=until, most=STEPS_BETWEEN
+            surface, xyz, T, reach=reach, until=until, most=STEPS_BETWEEN
         )
 
     # The last centimetres come from the finest points, within reach of what the last step left

@@ -36,7 +36,7 @@ BUDGET = 1e8
 KEEP = 256
 """Poses of the exhaustive part that climb."""
 
-GLANCE = 1.0 / 8.0
+GLANCE = 1.0 / 32.0
 """Share of `BUDGET` and of `KEEP` that a glance takes: cells twice as wide, yaws half as many."""
 
 CLOSE = 0.64
