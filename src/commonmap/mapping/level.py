@@ -32,6 +32,9 @@ MOST_POINTS = 600_000
 MOST_COARSE = 15_000
 """Points above ground that are looked at while the plan's cells are still wide."""
 
+MOST_OF_PART = 2_000
+"""Points above ground that are looked at of each part of the map."""
+
 PRIOR_TILT = math.radians(1.5)
 """How far from level a map is expected to be that says it is (standard deviation)."""
 
@@ -158,8 +161,9 @@ def _scatter_of_parts(xyz: Float64s, a: float, b: float) -> float:
     part = ij[:, 0] * 64 + ij[:, 1]
     found = []
     for p in np.unique(part):
-        inside = np.ascontiguousarray(xyz[part == p])
+        inside = xyz[part == p]
         if len(inside) >= 300:
+            inside = np.ascontiguousarray(sample(inside, MOST_OF_PART))
             found.append(_sharpest(inside, a, b, math.radians(4.0)))
     if len(found) < 3:
         return math.inf
