@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,9 @@ from hypothesis import strategies as st
 from commonmap.config import Config
 from commonmap.errors import EmptyMapError, InputError
 from commonmap.matching.decide import Figures, decide, features, is_open, told_apart
+from commonmap.matching.figures import is_told_at_a_glance
 from commonmap.matching.match import match
+from commonmap.matching.search import Peaks, SearchPlan, search
 from commonmap.types import Cloud, Float64s, Leaves, Match
 from matching_scenes import Place, apart, look, make_place, moved, rigid
 
@@ -368,7 +371,7 @@ def test_the_features_of_the_verdict_in_numbers() -> None:
     assert features(sure)["inliers"] == 3.0
 
 
-@pytest.mark.parametrize(("other", "looks_closer"), [(0, False), (60, True)])
+@pytest.mark.parametrize(("other", "looks_closer"), [(0, False), (68, True)])
 def test_a_doubtful_verdict_is_looked_at_closer_and_a_clear_one_is_not(
     other: int, looks_closer: bool
 ) -> None:
@@ -378,6 +381,65 @@ def test_a_doubtful_verdict_is_looked_at_closer_and_a_clear_one_is_not(
     figures = match(base, draft).evidence
     for name in ("half_1", "half_2", "second_ground"):
         assert (name in figures) == looks_closer
+
+
+@pytest.mark.parametrize(("other", "searches"), [(0, 2), (60, 4)])
+def test_maps_that_clearly_match_are_told_at_a_glance_and_others_are_searched(
+    other: int, searches: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plans: list[SearchPlan] = []
+
+    def spy(*args: Any, plan: SearchPlan, **options: Any) -> Peaks:
+        plans.append(plan)
+        return search(*args, plan=plan, **options)
+
+    monkeypatch.setattr("commonmap.matching.match.search", spy)
+    rng = np.random.default_rng(4)
+    base = look(make_place(4), rng)
+    draft = look(make_place(4 + other), rng, roofs=False, edge=26.0)
+    assert match(base, draft).accepted == (other == 0)
+    assert len(plans) == searches
+    assert [max(plan.keep) for plan in plans] == [32, 32, 256, 256][:searches]
+
+
+@pytest.mark.parametrize(
+    ("best", "elsewhere", "mirrored", "told"),
+    [
+        (400.0, 100.0, 100.0, True),
+        (400.0, 100.1, 50.0, False),
+        (400.0, 50.0, 100.1, False),
+        (100.0, 1.0, 1.0, True),
+        (99.9, 1.0, 1.0, False),
+    ],
+)
+def test_a_glance_tells_what_stands_four_times_above_chance(
+    best: float, elsewhere: float, mirrored: float, told: bool
+) -> None:
+    def peaks(score: list[float], x: list[float]) -> Peaks:
+        pose = np.column_stack([x, np.zeros((len(x), 2))])
+        ones = np.ones(len(x))
+        return Peaks(pose, np.array(score), ones, np.zeros(2), np.zeros((0, 2)), 0.5)
+
+    # what lies within 3 m of the best pose is the best pose
+    found = peaks([best, 0.9 * best, elsewhere], [0.0, 2.0, 4.0])
+    assert is_told_at_a_glance(found, peaks([mirrored], [0.0])) == told
+    assert not is_told_at_a_glance(peaks([], []), peaks([], []))
+
+
+@pytest.mark.parametrize(
+    "flaw",
+    [{"converged": 0.0}, {"evidence": 99.0}, {"decoy_ratio": 1.0}, {"second_ratio": 1.2}],
+)
+def test_what_no_closer_look_could_make_up_for_gets_none(flaw: dict[str, float]) -> None:
+    doubtful = replace(
+        figures_of_a_good_match(), decoy_ratio=3.0, second_ratio=2.5, inliers=0.6,
+        decoy_inliers=0.3, ground=0.1, decoy_ground=0.25,
+    )  # fmt: skip
+    flawed = replace(doubtful, **flaw)
+    assert is_open(doubtful)
+    assert not is_open(flawed)
+    best = replace(flawed, half_1=4.0, half_2=4.0, second_ground=10.0)
+    assert not decide(best).accepted
 
 
 def test_the_halves_of_a_lucky_overlap_turn_the_verdict() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from commonmap.frames import from_xyz_yaw
 from commonmap.mapping.ground import Ground
-from commonmap.mapping.points import thin
+from commonmap.mapping.points import first_of_voxels, rows_of, sample, sample_where, thin
+from commonmap.matching.covariance import Pairs, pair_points
 from commonmap.matching.inliers import share_of_inliers
 from commonmap.matching.refine import lift, refine
 from commonmap.types import Float64s
@@ -231,6 +233,45 @@ def test_thin_equals_its_slow_twin(seed: int, voxel: float) -> None:
     expected = sorted(tuple(np.mean(g, axis=0)) for g in groups.values())
     got = sorted(tuple(p) for p in thin(xyz, voxel).tolist())
     assert np.array(got) == pytest.approx(np.array(expected), abs=1e-9)
+
+
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(st.integers(0, 2**31), st.sampled_from([0.1, 0.25, 1.0]))
+def test_the_first_point_of_each_voxel_is_that_of_a_dictionary(seed: int, voxel: float) -> None:
+    rng = np.random.default_rng(seed)
+    xyz = rng.normal(size=(int(rng.integers(1, 500)), 3)) * [3.0, 3.0, 1.0]
+    first: dict[tuple[int, ...], int] = {}
+    for n, key in enumerate(np.floor(xyz / voxel).astype(int).tolist()):
+        first.setdefault(tuple(key), n)
+    assert first_of_voxels(xyz, voxel).tolist() == list(first.values())
+
+
+def test_wanted_points_are_those_of_a_mask() -> None:
+    rng = np.random.default_rng(0)
+    xyz, wanted = rng.normal(size=(1000, 3)), rng.random(1000) < 0.4
+    assert np.array_equal(rows_of(xyz, wanted), xyz[wanted])
+    assert rows_of(xyz, np.zeros(1000, bool)).shape == (0, 3)
+    assert np.array_equal(sample_where(xyz, wanted, 1000), xyz[wanted])
+    assert np.array_equal(sample_where(xyz, wanted, 50), sample(xyz[wanted], 50))
+
+
+def test_the_last_steps_reach_no_further_than_the_cell_allows(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    reaches: list[float] = []
+
+    def spy(*args: Any, reach: float, **options: Any) -> Pairs | None:
+        reaches.append(reach)
+        return pair_points(*args, reach=reach, **options)
+
+    monkeypatch.setattr("commonmap.matching.refine.pair_points", spy)
+    rng = np.random.default_rng(3)
+    base, draft = (yard(rng) + rng.normal(0.0, 0.1, (1, 3)) for _ in range(2))
+    rough = [xyz + rng.normal(0.0, 0.12, xyz.shape) for xyz in (base, draft)]
+    assert refine(*rough, np.eye(4), cell=0.2).converged
+    assert reaches[0] == pytest.approx(0.6)
+    assert reaches[-1] == pytest.approx(0.15)  # residuals of 0.1 m do not widen it
+    assert reaches == sorted(reaches, reverse=True)
 
 
 def test_thin_stays_near_its_limit() -> None:

@@ -14,6 +14,7 @@ from commonmap.matching.search import (
     Peaks,
     SearchPlan,
     evidence_at,
+    plan_glance,
     plan_search,
     search,
     separate,
@@ -205,6 +206,9 @@ def test_the_plan_keeps_sixteen_cells_and_its_budget() -> None:
     target, source, _ = small_pair(12)
     base, draft = slabs(target), slabs(source)
     rich, poor = plan_search(base, draft, budget=1e12), plan_search(base, draft, budget=1.0)
+    glance = plan_glance(base, draft)
+    assert glance.cells == plan_search(base, draft, budget=1e8 / 32).cells
+    assert glance.keep == (32, 8, 3, 3)[: len(glance.cells)]
     assert rich.cells == (0.5,)
     assert len(poor.cells) > 1
     assert all(a == 2.0 * b for a, b in zip(poor.cells[:-1], poor.cells[1:], strict=True))

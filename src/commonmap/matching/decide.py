@@ -149,8 +149,17 @@ def at_first_look(figures: Figures) -> Figures:
 
 
 def is_open(figures: Figures) -> bool:
-    """Return whether the figures at first look leave the verdict open."""
-    return OPEN[0] < probability(at_first_look(figures)) < OPEN[1]
+    """Return whether the figures at first look leave the verdict open.
+
+    They do not where no probability could make up for what else they say.
+    """
+    lost = (
+        not figures.converged
+        or figures.evidence < LEAST_EVIDENCE
+        or figures.decoy_ratio <= 1.0
+        or told_apart(figures.second_ratio) < ACCEPT_AT
+    )
+    return not lost and OPEN[0] < probability(at_first_look(figures)) < OPEN[1]
 
 
 def rank_value(score: float, inliers: float, ground: float | None) -> float:
