@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -94,16 +95,32 @@ def pair_points(
     Residual `r = n . (T p - q)`, Cauchy weights of the given scale or their own, metres.
     """
     moved = move(T, source)
-    distance, index = surface.tree.query(moved, distance_upper_bound=reach, workers=1)
-    hit = np.isfinite(distance)
-    if np.count_nonzero(hit) < 20:
+    _, index = surface.tree.query(moved, distance_upper_bound=reach, workers=1)
+    hit = np.flatnonzero(index < len(surface.points))
+    if len(hit) < 20:
         return None
-    p, n = moved[hit], surface.normals[index[hit]]
-    r = np.einsum("ij,ij->i", n, p - surface.points[index[hit]])
+    on, normals = index[hit], surface.normals
+    if isinstance(normals, Normals):
+        normals = normals.at_least(on)
+    p, J, r = _lay_on(moved, hit, surface.points, normals, on)
     if scale is None:
         scale = max(1.4826 * float(np.median(np.abs(r))), 0.01)
     w = 1.0 / (1.0 + (r / (2.0 * scale)) ** 2)
-    return Pairs(p, np.hstack([n, np.cross(p, n)]), w, r, scale)
+    return Pairs(p, J, w, r, scale)
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _lay_on(moved, hit, points, normals, on):  # type: ignore[no-untyped-def]
+    """Return p (M, 3), J (M, 6) and r (M,) of the points `hit`, each on one of a surface's."""
+    p, J, r = np.empty((hit.shape[0], 3)), np.empty((hit.shape[0], 6)), np.empty(hit.shape[0])
+    for k in range(hit.shape[0]):
+        x, y, z = moved[hit[k], 0], moved[hit[k], 1], moved[hit[k], 2]
+        q, n = points[on[k]], normals[on[k]]
+        p[k, 0], p[k, 1], p[k, 2] = x, y, z
+        J[k, 0], J[k, 1], J[k, 2] = n[0], n[1], n[2]
+        J[k, 3], J[k, 4], J[k, 5] = y * n[2] - z * n[1], z * n[0] - x * n[2], x * n[1] - y * n[0]
+        r[k] = n[0] * (x - q[0]) + n[1] * (y - q[1]) + n[2] * (z - q[2])
+    return p, J, r
 
 
 def measure_covariance(

@@ -24,7 +24,7 @@ CLEAR_BY = 4.0
 score of a pose must be at a glance. Some other places reach more, but with a tenth of the score."""
 
 CLEAR_FROM = 100.0
-"""Score, nats, that a pose must have at a glance. Of 7,600 drafts of other places those that stood
+"""Score, nats, that a pose must have at a glance. Of 11,100 drafts of other places those that stood
 four times above chance came to 72 at most (docs/matching.md)."""
 
 

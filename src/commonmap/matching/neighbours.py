@@ -81,6 +81,10 @@ class Normals:
         self._found = np.zeros(len(index.points), dtype=bool)
 
     def __getitem__(self, which: NDArray[np.int64]) -> Float64s:
+        return np.asarray(self.at_least(which)[which])
+
+    def at_least(self, which: NDArray[np.int64]) -> Float64s:
+        """Return the normals (N, 3) of all points; only those of (M,) points must be right."""
         wanted = np.zeros(len(self._found), dtype=bool)
         wanted[which] = True
         wanted &= ~self._found
@@ -91,7 +95,7 @@ class Normals:
                 self.n_neighbours, wanted, self._normal,
             )  # fmt: skip
             self._found |= wanted
-        return np.asarray(self._normal[which])
+        return self._normal
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
