@@ -14,7 +14,14 @@ from scipy.spatial.transform import Rotation
 
 from commonmap.frames import from_xyz_yaw
 from commonmap.mapping.ground import Ground
-from commonmap.mapping.points import first_of_voxels, rows_of, sample, sample_where, thin
+from commonmap.mapping.points import (
+    first_of_voxels,
+    floor_int,
+    rows_of,
+    sample,
+    sample_where,
+    thin,
+)
 from commonmap.matching.covariance import Pairs, pair_points
 from commonmap.matching.inliers import share_of_inliers
 from commonmap.matching.refine import lift, refine
@@ -244,6 +251,11 @@ def test_the_first_point_of_each_voxel_is_that_of_a_dictionary(seed: int, voxel:
     for n, key in enumerate(np.floor(xyz / voxel).astype(int).tolist()):
         first.setdefault(tuple(key), n)
     assert first_of_voxels(xyz, voxel).tolist() == list(first.values())
+
+
+@given(st.floats(-1e15, 1e15))
+def test_floor_int_is_the_floor(value: float) -> None:
+    assert floor_int(value) == math.floor(value)
 
 
 def test_wanted_points_are_those_of_a_mask() -> None:

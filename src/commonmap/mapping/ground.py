@@ -17,7 +17,7 @@ import numpy as np
 from scipy import ndimage
 
 from commonmap.errors import EmptyMapError
-from commonmap.mapping.points import bounds, sampled
+from commonmap.mapping.points import bounds, floor_int, sampled
 from commonmap.types import Bools, Float64s
 
 MAX_SLOPE = math.tan(math.radians(38.0))
@@ -212,8 +212,8 @@ def _pull(coarse, value, weight):  # type: ignore[no-untyped-def]
 def _lowest(xyz, origin, cell, nx, ny):  # type: ignore[no-untyped-def]
     z = np.full((nx, ny), np.nan)
     for n in range(xyz.shape[0]):
-        i = int(np.floor((xyz[n, 0] - origin[0]) / cell))
-        j = int(np.floor((xyz[n, 1] - origin[1]) / cell))
+        i = floor_int((xyz[n, 0] - origin[0]) / cell)
+        j = floor_int((xyz[n, 1] - origin[1]) / cell)
         if not z[i, j] <= xyz[n, 2]:
             z[i, j] = xyz[n, 2]
     return z

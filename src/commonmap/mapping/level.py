@@ -17,7 +17,7 @@ import numpy as np
 
 from commonmap.frames import apply, from_rotation, rotation_between
 from commonmap.mapping.ground import find_ground
-from commonmap.mapping.points import bounds, first_of_voxels, move, rows_of, sample
+from commonmap.mapping.points import bounds, first_of_voxels, floor_int, move, rows_of, sample
 from commonmap.types import Float64s
 
 MAX_SIGMA = math.radians(2.0)
@@ -212,8 +212,8 @@ def _plan_cells(xyz, axis, lines, cell):  # type: ignore[no-untyped-def]
             x = xyz[k, axis] - slope * xyz[k, 2]
             low, high = min(low, x), max(high, x)
             at = x * scale
-            out[p, 0, k] = np.int32(np.floor(at))
-            out[p, 1, k] = np.int32(np.floor(at + 0.5))
+            out[p, 0, k] = np.int32(floor_int(at))
+            out[p, 1, k] = np.int32(floor_int(at + 0.5))
         span = max(span, high - low)
     n = 64
     while n < 1024 and n * cell < span + 2.0 * cell:
@@ -266,7 +266,7 @@ def _smooth_share(xyz, R, size):  # type: ignore[no-untyped-def]
         x = R[0, 0] * xyz[k, 0] + R[0, 1] * xyz[k, 1] + R[0, 2] * xyz[k, 2]
         y = R[1, 0] * xyz[k, 0] + R[1, 1] * xyz[k, 1] + R[1, 2] * xyz[k, 2]
         h = R[2, 0] * xyz[k, 0] + R[2, 1] * xyz[k, 1] + R[2, 2] * xyz[k, 2]
-        i, j = int(np.floor(x / size)) + n // 2, int(np.floor(y / size)) + n // 2
+        i, j = floor_int(x / size) + n // 2, floor_int(y / size) + n // 2
         if 0 <= i < n and 0 <= j < n and h < z[i, j]:
             z[i, j] = h
     columns, smooth = 0, 0

@@ -18,6 +18,16 @@ MAX_VOXELS = 20_000_000
 """Pruned leaves are opened up to about this many voxels; beyond, each stands for itself."""
 
 
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def floor_int(value):  # type: ignore[no-untyped-def]
+    """Return the whole number at or below a value, which must lie within 2^62.
+
+    What `np.floor` says, in instructions that the compiler can do side by side.
+    """
+    whole = np.int64(value)
+    return whole - np.int64(value < whole)
+
+
 def points_of(item: Cloud | Leaves | Float64s, name: str = "map") -> Float64s:
     """Return the finite points (N, 3) float64 of a map: of an octree, its occupied voxels' centres.
 
@@ -217,7 +227,7 @@ def _voxel_keys(xyz, scale, low, shape):  # type: ignore[no-untyped-def]
     for n in range(xyz.shape[0]):
         number = np.int64(0)
         for a in range(3):
-            number = number * shape[a] + np.int64(np.floor(xyz[n, a] * scale) - low[a])
+            number = number * shape[a] + floor_int(xyz[n, a] * scale) - np.int64(low[a])
         key[n] = number & np.int64((1 << 62) - 1)
     return key
 
@@ -251,13 +261,16 @@ def _sort(key):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
 def _means(xyz, order, starts):  # type: ignore[no-untyped-def]
-    out = np.zeros((starts.shape[0] - 1, 3))
+    out = np.empty((starts.shape[0] - 1, 3))
     for v in range(starts.shape[0] - 1):
+        x, y, z = 0.0, 0.0, 0.0
         for n in range(starts[v], starts[v + 1]):
-            for a in range(3):
-                out[v, a] += xyz[order[n], a]
-        for a in range(3):
-            out[v, a] /= starts[v + 1] - starts[v]
+            m = order[n]
+            x += xyz[m, 0]
+            y += xyz[m, 1]
+            z += xyz[m, 2]
+        number = starts[v + 1] - starts[v]
+        out[v, 0], out[v, 1], out[v, 2] = x / number, y / number, z / number
     return out
 
 

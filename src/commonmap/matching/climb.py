@@ -75,6 +75,7 @@ def climb_all(
     order = np.argsort(pose[:, 2], kind="stable")
     n_blocks = workers if level.whole is not None else len(pose)
     blocks = np.array_split(order, max(1, n_blocks))
+    xy = np.ascontiguousarray(columns.xy.T)
     whole = None if level.whole is None else _pack(level.whole, pad, alike)
 
     def climb(block: NDArray[np.int64]) -> Float64s:
@@ -84,7 +85,7 @@ def climb_all(
         return np.asarray(
             _climb(
                 *(whole or _pack(window, pad, alike)), pad, level.origin, level.cell, first_i,
-                first_j, columns.xy, columns.occupied, columns.known, columns.n_slabs, side,
+                first_j, xy, columns.occupied, columns.known, columns.n_slabs, side,
                 pose[block], yaw_step, least_pairs, starts, each, farthest + 1, table,
             )
         )  # fmt: skip

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from commonmap.frames import apply
-from commonmap.mapping.points import bounds, sample_where
+from commonmap.mapping.points import bounds, floor_int, sample_where
 from commonmap.types import Bools, Float64s
 
 MOST_POINTS = 20_000
@@ -69,8 +69,8 @@ def _columns(
     seen = np.zeros(n_x * n_y + 1, np.bool_)
     starts = np.zeros(n_x * n_y + 2, np.int64)
     for n in range(xyz.shape[0]):
-        i = int(np.floor((xyz[n, 0] - low[0]) / size))
-        j = int(np.floor((xyz[n, 1] - low[1]) / size))
+        i = floor_int((xyz[n, 0] - low[0]) / size)
+        j = floor_int((xyz[n, 1] - low[1]) / size)
         inside = 0 <= i < n_x and 0 <= j < n_y
         cell[n] = i * n_y + j if inside else n_x * n_y
         seen[cell[n]] = True
@@ -93,8 +93,8 @@ def _look(
 ) -> tuple[int, int]:  # fmt: skip  # pragma: no cover
     known, near = 0, 0
     for n in range(draft.shape[0]):
-        i = int(np.floor((draft[n, 0] - low[0]) / reach))
-        j = int(np.floor((draft[n, 1] - low[1]) / reach))
+        i = floor_int((draft[n, 0] - low[0]) / reach)
+        j = floor_int((draft[n, 1] - low[1]) / reach)
         if i < 1 or j < 1 or i > n_x - 2 or j > n_y - 2:
             continue  # beyond all that the target has
         over, hit = False, False

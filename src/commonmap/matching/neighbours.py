@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from commonmap.mapping.points import bounds
+from commonmap.mapping.points import bounds, floor_int
 from commonmap.types import Float64s
 
 MOST_NEIGHBOURS = 32
@@ -126,7 +126,7 @@ def _query(points, number, starts, low, size, n_x, n_y, xyz, reach):  # type: ig
     for n in range(xyz.shape[0]):
         x, y, z = xyz[n, 0], xyz[n, 1], xyz[n, 2]
         u, v = (x - low[0]) / size, (y - low[1]) / size
-        i0, j0 = int(np.floor(u)), int(np.floor(v))
+        i0, j0 = floor_int(u), floor_int(v)
         # how far the border of the point's own column is, at the nearest
         inner = min(min(u - i0, i0 + 1.0 - u), min(v - j0, j0 + 1.0 - v)) * size
         nearest, best = most, -1

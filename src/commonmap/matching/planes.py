@@ -10,6 +10,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from commonmap.mapping.points import floor_int
 from commonmap.matching.lanes import WIDTH, count_ones, load, spread, store
 from commonmap.matching.slabs import Bits
 
@@ -45,6 +46,15 @@ def _set_planes(planes, i, j, bits, n_slabs):  # type: ignore[no-untyped-def]
             planes[i, j >> 6, k] |= cell
         bits >>= np.uint32(1)
         k += 1
+
+
+def _mask_table() -> Words:
+    """Return for each byte eight words, all ones where its bit is set, one after the other."""
+    bits = np.arange(256)[:, None] >> np.arange(WIDTH) & 1
+    return np.where(bits == 1, np.uint64(0xFFFFFFFFFFFFFFFF), np.uint64(0)).ravel()
+
+
+MASKS = _mask_table()
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
@@ -111,27 +121,48 @@ def turn_planes(  # type: ignore[no-untyped-def]
 ):
     """Fill the planes of the source turned by `yaw`, for the four ways to pair up half cells.
 
-    x, y: in cells, where the source's origin lies in a cell, 0 to 1. half_o, half_k: (2 side,
-    n_words, .) room for planes of half cells. out_occupied, out_known: (4, side, n_words, .); at
-    [2 a + b] cell [i, j] holds the half cells 2 i - a, 2 i - a + 1 and 2 j - b, 2 j - b + 1. Half
-    cell [side, side] holds the origin of the cell that the source's origin lies in.
+    xy: (2, N) metres, about the source's origin. x, y: in cells, where that lies in a cell, 0 to 1.
+    half_o, half_k: (2 side, n_words, .) room for planes of half cells. out_occupied, out_known:
+    (4, side, n_words, .); at [2 a + b] cell [i, j] holds the half cells 2 i - a, 2 i - a + 1 and
+    2 j - b, 2 j - b + 1. Half cell [side, side] holds the origin of the cell that the source's
+    origin lies in.
     """
     half_o[:] = 0
     half_k[:] = 0
-    side = out_occupied.shape[1]
+    side, n_words = out_occupied.shape[1], half_o.shape[1]
     cosine, sine = np.cos(yaw), np.sin(yaw)
     scale = 2.0 / cell
-    n_known = 1 if half_k.shape[2] == 1 else n_slabs
-    for n in range(xy.shape[0]):
-        h = int(np.floor((cosine * xy[n, 0] - sine * xy[n, 1]) * scale + 2.0 * x)) + side - 1
-        v = int(np.floor((sine * xy[n, 0] + cosine * xy[n, 1]) * scale + 2.0 * y)) + side - 1
-        _set_planes(half_o, h, v, s_occupied[n], n_slabs)
-        _set_planes(half_k, h, v, s_known[n], n_known)
+    xs, ys = xy[0], xy[1]
+    h, v = np.empty(xs.shape[0], np.int32), np.empty(xs.shape[0], np.int32)
+    for n in range(xs.shape[0]):
+        h[n] = floor_int((cosine * xs[n] - sine * ys[n]) * scale + 2.0 * x)
+        v[n] = floor_int((sine * xs[n] + cosine * ys[n]) * scale + 2.0 * y)
+    masks, words_o, words_k = MASKS, half_o.reshape(-1), half_k.reshape(-1)
+    shared = half_k.shape[2] == 1
+    for n in range(xs.shape[0]):
+        j = v[n] + side - 1
+        word, bit = (h[n] + side - 1) * n_words + (j >> 6), np.uint64(1) << np.uint64(j & 63)
+        _set_lanes(words_o, word * half_o.shape[2], bit, s_occupied[n], n_slabs, masks)
+        if not shared:
+            _set_lanes(words_k, word * half_k.shape[2], bit, s_known[n], n_slabs, masks)
+        elif s_known[n] & np.uint32(1):
+            words_k[word] |= bit
     _pair_up_lanes(half_o, out_occupied)
-    if half_k.shape[2] == 1:
+    if shared:
         _pair_up_words(half_k, out_known)
     else:
         _pair_up_lanes(half_k, out_known)
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _set_lanes(words, at, bit, bits, n_slabs, masks):  # type: ignore[no-untyped-def]
+    """Set a bit of the words that begin at `at`, one a slab, of all slabs that are in `bits`."""
+    g = 0
+    while bits != 0 and g < n_slabs:
+        which = np.int64(bits & np.uint32(255)) * WIDTH
+        store(words, at + g, load(words, at + g) | (load(masks, which) & bit))
+        bits >>= np.uint32(8)
+        g += WIDTH
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]

@@ -13,6 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from commonmap.mapping.points import floor_int
 from commonmap.matching.arrays import Array, Arrays
 from commonmap.types import Bools, Float64s
 
@@ -164,8 +165,8 @@ def list_columns(grid: SlabGrid) -> Columns:
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
 def turned_cell(x, y, cosine, sine, cell, low):  # type: ignore[no-untyped-def]
     """Return the cell (i, j), on a grid with lower corner `low`, of a point that is turned."""
-    i = int(np.floor((cosine * x - sine * y - low[0]) / cell))
-    return i, int(np.floor((sine * x + cosine * y - low[1]) / cell))
+    i = floor_int((cosine * x - sine * y - low[0]) / cell)
+    return i, floor_int((sine * x + cosine * y - low[1]) / cell)
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
