@@ -432,12 +432,14 @@ def test_a_glance_tells_what_stands_four_times_above_chance(
 )
 def test_what_no_closer_look_could_make_up_for_gets_none(flaw: dict[str, float]) -> None:
     doubtful = replace(
-        figures_of_a_good_match(), decoy_ratio=3.0, second_ratio=2.5, inliers=0.6,
-        decoy_inliers=0.3, ground=0.1, decoy_ground=0.25,
+        figures_of_a_good_match(), decoy_ratio=1.5, second_ratio=1.5, inliers=0.4,
+        decoy_inliers=0.3, ground=0.1, decoy_ground=0.25, moved=1.0,
     )  # fmt: skip
     flawed = replace(doubtful, **flaw)
     assert is_open(doubtful)
     assert not is_open(flawed)
+    # but where it may well be right all the same, how likely that is is looked at
+    assert is_open(replace(flawed, moved=0.2))
     best = replace(flawed, half_1=4.0, half_2=4.0, second_ground=10.0)
     assert not decide(best).accepted
 

@@ -104,6 +104,9 @@ OPEN = (0.001, 0.9995)
 """Between these probabilities the quick model is not sure, and a closer look follows: at the halves
 of the overlap, and at the ground under the best pose elsewhere."""
 
+HOPELESS = 0.1
+"""Probability at first look under which a pose that is refused anyway is not looked at closer."""
+
 GROUND_NOISE = 0.15
 """Metres, of what two lidars see of one ground under growth."""
 
@@ -151,15 +154,19 @@ def at_first_look(figures: Figures) -> Figures:
 def is_open(figures: Figures) -> bool:
     """Return whether the figures at first look leave the verdict open.
 
-    They do not where no probability could make up for what else they say.
+    Where no probability could make up for what else they say, only how unlikely the pose is is
+    open, and that matters from `HOPELESS` on.
     """
+    first = at_first_look(figures)
     lost = (
         not figures.converged
         or figures.evidence < LEAST_EVIDENCE
         or figures.decoy_ratio <= 1.0
         or told_apart(figures.second_ratio) < ACCEPT_AT
     )
-    return not lost and OPEN[0] < probability(at_first_look(figures)) < OPEN[1]
+    if lost and decide(first).confidence < HOPELESS:
+        return False
+    return OPEN[0] < probability(first) < OPEN[1]
 
 
 def rank_value(score: float, inliers: float, ground: float | None) -> float:
