@@ -278,9 +278,8 @@ def test_the_last_steps_reach_no_further_than_the_cell_allows(
 
     monkeypatch.setattr("commonmap.matching.refine.pair_points", spy)
     rng = np.random.default_rng(3)
-    base, draft = (yard(rng) + rng.normal(0.0, 0.1, (1, 3)) for _ in range(2))
-    rough = [xyz + rng.normal(0.0, 0.12, xyz.shape) for xyz in (base, draft)]
-    assert refine(*rough, np.eye(4), cell=0.2).converged
+    base, draft = (xyz + rng.normal(0.0, 0.12, xyz.shape) for xyz in (yard(rng), yard(rng)))
+    assert refine(base, draft, np.eye(4), cell=0.2).converged
     assert reaches[0] == pytest.approx(0.6)
     assert reaches[-1] == pytest.approx(0.15)  # residuals of 0.1 m do not widen it
     assert reaches == sorted(reaches, reverse=True)
