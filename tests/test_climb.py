@@ -183,9 +183,7 @@ def test_half_cells_pair_up_in_four_ways(side: int, alone: bool) -> None:
         )
     ]
     found = [np.empty((4, side, n_words, room.shape[2]), np.uint64) for room in rooms]
-    turn_planes(
-        np.ascontiguousarray(xy.T), occupied, known, n_slabs, yaw, 1.0, x, y, *rooms, *found
-    )
+    turn_planes(np.ascontiguousarray(xy.T), occupied, known, yaw, 1.0, x, y, *rooms, *found)
     # the slow twin: a set of half cells, then of cells
     turned = xy @ np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
     half = np.floor(2.0 * turned + 2.0 * np.array([x, y])).astype(int) + side - 1

@@ -17,7 +17,7 @@ import numpy as np
 from scipy import ndimage
 
 from commonmap.errors import EmptyMapError
-from commonmap.mapping.points import bounds, floor_int, sampled
+from commonmap.mapping.points import bounds, floor_int, sample
 from commonmap.types import Bools, Float64s
 
 MAX_SLOPE = math.tan(math.radians(38.0))
@@ -132,9 +132,7 @@ def _fit_plane(z: Float64s, known: Bools) -> tuple[float, float, float]:
 
     Least squares over `PLANE_CELLS` of them, three times reweighted (Cauchy).
     """
-    at = np.flatnonzero(known)
-    if len(at) > PLANE_CELLS:
-        at = at[sampled(len(at), PLANE_CELLS)]
+    at = sample(np.flatnonzero(known), PLANE_CELLS)
     ij = np.column_stack(np.unravel_index(at, z.shape)).astype(np.float64)
     middle = ij.mean(axis=0)
     A, b = np.column_stack([ij - middle, np.ones(len(at))]), z.ravel()[at]

@@ -117,7 +117,7 @@ def _sharpest(
     peak_only: return NaN where the sharpest lies on the border of what was looked at. On wide cells
     `MOST_COARSE` of the points tell where it is; all of them do on the finest.
     """
-    some = np.ascontiguousarray(sample(xyz, MOST_COARSE))
+    some = sample(xyz, MOST_COARSE)
     height = max(float(np.ptp(np.quantile(sample(xyz, 10_000)[:, 2], [0.05, 0.95]))), 1.0)
     cell = max(0.6, width * height / 16.0)
     finest = max(0.1, math.radians(0.2) * height)
@@ -163,8 +163,7 @@ def _scatter_of_parts(xyz: Float64s, a: float, b: float) -> float:
     for p in np.unique(part):
         inside = xyz[part == p]
         if len(inside) >= 300:
-            inside = np.ascontiguousarray(sample(inside, MOST_OF_PART))
-            found.append(_sharpest(inside, a, b, math.radians(4.0)))
+            found.append(_sharpest(sample(inside, MOST_OF_PART), a, b, math.radians(4.0)))
     if len(found) < 3:
         return math.inf
     off = np.array(found) - np.array([a, b])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
@@ -11,6 +12,8 @@ from numpy.typing import NDArray
 from commonmap.errors import EmptyMapError
 from commonmap.frames import apply, check_points
 from commonmap.types import TREE_DEPTH, Bools, Cloud, Float64s, Leaves
+
+Rows = TypeVar("Rows", bound=NDArray[Any])
 
 GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
@@ -99,19 +102,18 @@ def _rows_of(xyz, wanted):  # type: ignore[no-untyped-def]
     return out
 
 
-def sample(xyz: Float64s, n_most: int) -> Float64s:
-    """Return at most `n_most` of the points, one from each of as many equal runs of them.
+def sample(xyz: Rows, n_most: int) -> Rows:
+    """Return at most `n_most` of the points (or other rows), one from each of as many equal runs.
 
     Where in its run a point is taken from follows the golden ratio: an even step would meet the
     same rings of a spinning lidar over and over.
     """
-    return xyz if len(xyz) <= n_most else xyz[sampled(len(xyz), n_most)]
+    return xyz if len(xyz) <= n_most else cast(Rows, xyz[sampled(len(xyz), n_most)])
 
 
 def sample_where(xyz: Float64s, wanted: Bools, n_most: int) -> Float64s:
     """Return what `sample` takes of the wanted points, (N,) bool."""
-    which = np.flatnonzero(wanted)
-    return xyz[which if len(which) <= n_most else which[sampled(len(which), n_most)]]
+    return xyz[sample(np.flatnonzero(wanted), n_most)]
 
 
 def sampled(n: int, n_most: int) -> NDArray[np.int64]:
@@ -163,7 +165,7 @@ def thin(xyz: Float64s, voxel: float, n_most: int | None = None) -> Float64s:
 
 def first_of_voxels(xyz: Float64s, voxel: float) -> NDArray[np.int64]:
     """Return the index of the first point of every voxel of a width in metres, rising."""
-    return np.asarray(_first_of_keys(_keys(np.ascontiguousarray(xyz), voxel)))
+    return np.asarray(_first_of_keys(_keys(xyz, voxel)))
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
@@ -188,13 +190,13 @@ def _first_of_keys(key):  # type: ignore[no-untyped-def]
 
 def _group(xyz: Float64s, voxel: float) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """Return the points' order by voxel, and where each voxel starts in it."""
-    order, key = _sort(_keys(np.ascontiguousarray(xyz), voxel))
+    order, key = _sort(_keys(xyz, voxel))
     return order, np.asarray(_starts(key))
 
 
 def _keys(xyz: Float64s, voxel: float) -> NDArray[np.int32] | NDArray[np.int64]:
     """Return the number of each point's voxel, see `_voxel_keys`."""
-    scale = 1.0 / voxel
+    xyz, scale = np.ascontiguousarray(xyz), 1.0 / voxel
     low, high = (np.floor(end * scale) for end in bounds(xyz))
     shape = high - low + 1.0
     key: NDArray[np.int64] = _voxel_keys(xyz, scale, low, shape.astype(np.int64))

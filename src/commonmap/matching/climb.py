@@ -205,7 +205,7 @@ def _score(  # type: ignore[no-untyped-def]
     if kept[slot, 0] != yaw or kept[slot, 1] != place[2] or kept[slot, 2] != place[3]:
         kept[slot, 0], kept[slot, 1], kept[slot, 2] = yaw, place[2], place[3]
         turn_planes(
-            xy, s_occupied, s_known, n_slabs, yaw, cell, place[2], place[3], half_o, half_k,
+            xy, s_occupied, s_known, yaw, cell, place[2], place[3], half_o, half_k,
             turned_o[slot], turned_k[slot],
         )  # fmt: skip
     i, j = a - middle, b - middle

@@ -130,8 +130,8 @@ def measure_covariance(
     """Return the covariance (6, 6) of a pose T that the pairs settled on, metres and radians."""
     K_inverse = _invert_grip(pairs.curvature(), *_grip(surface, source, T, pairs, reach, spacing))
     # the shape of B from patches of all widths, its size from the width that says the most
-    pulls = pairs.pulls()
-    spreads = [_spread(pairs, pulls, n) for n in PATCHES]
+    xy, pulls = pairs.p[:, :2], pairs.pulls()
+    spreads = [_spread(xy, pulls, n) for n in PATCHES]
     sizes = [float(np.trace(K_inverse @ B)) for B in spreads]
     B = np.mean(spreads, axis=0) * (max(sizes) / max(float(np.mean(sizes)), 1e-300))
     covariance = K_inverse @ B @ K_inverse + SMALLEST + _common(pairs.scale)
@@ -144,11 +144,11 @@ def _common(scale: float) -> Float64s:
     return np.asarray(np.diag([COMMON**2 * loose] * 2 + [0.0] * 4))
 
 
-def _spread(pairs: Pairs, pulls: Float64s, n_side: int) -> Float64s:
+def _spread(xy: Float64s, pulls: Float64s, n_side: int) -> Float64s:
     """Return the covariance (6, 6) of the summed pulls, from what patches of the plan pull."""
-    low, high = pairs.p[:, :2].min(axis=0), pairs.p[:, :2].max(axis=0)
+    low, high = xy.min(axis=0), xy.max(axis=0)
     size = max(float((high - low).max()) / n_side, 1e-6)
-    ij = ((pairs.p[:, :2] - low) / size).astype(np.int64)
+    ij = ((xy - low) / size).astype(np.int64)
     patch = ij[:, 0] * (n_side + 1) + ij[:, 1]
     n = np.count_nonzero(np.bincount(patch))
     each = np.stack([np.bincount(patch, weights=column) for column in pulls.T])

@@ -158,15 +158,23 @@ def is_open(figures: Figures) -> bool:
     open, and that matters from `HOPELESS` on.
     """
     first = at_first_look(figures)
-    lost = (
-        not figures.converged
-        or figures.evidence < LEAST_EVIDENCE
+    if _is_lost(figures) and decide(first).confidence < HOPELESS:
+        return False
+    return OPEN[0] < probability(first) < OPEN[1]
+
+
+def _is_lost(figures: Figures) -> bool:
+    """Return whether something refuses the pose that no probability makes up for."""
+    return (
+        not _is_held(figures)
         or figures.decoy_ratio <= 1.0
         or told_apart(figures.second_ratio) < ACCEPT_AT
     )
-    if lost and decide(first).confidence < HOPELESS:
-        return False
-    return OPEN[0] < probability(first) < OPEN[1]
+
+
+def _is_held(figures: Figures) -> bool:
+    """Return whether the points stayed at the pose, and enough speaks for it to fix one at all."""
+    return bool(figures.converged) and figures.evidence >= LEAST_EVIDENCE
 
 
 def rank_value(score: float, inliers: float, ground: float | None) -> float:
@@ -181,18 +189,9 @@ def rank_value(score: float, inliers: float, ground: float | None) -> float:
 def decide(figures: Figures) -> Verdict:
     """Return the verdict on a best pose."""
     confidence = min(probability(figures), told_apart(figures.second_ratio))
-    if not figures.converged:
+    if not _is_held(figures):
         confidence = min(confidence, 0.5)
-        reason = "refused: the refinement on the points left the place that the search had found"
-        return Verdict(False, confidence, reason)
-    if figures.evidence < LEAST_EVIDENCE:
-        confidence = min(confidence, 0.5)
-        reason = (
-            f"refused: the best pose has only {figures.evidence:.0f} nats of evidence, too little "
-            f"to rely on (at least {LEAST_EVIDENCE:.0f} are needed)"
-        )
-        return Verdict(False, confidence, reason)
-    if confidence >= ACCEPT_AT and figures.decoy_ratio > 1.0:
+    if confidence >= ACCEPT_AT and not _is_lost(figures):
         return Verdict(
             True,
             confidence,
@@ -205,6 +204,13 @@ def decide(figures: Figures) -> Verdict:
 
 def _weakness(figures: Figures) -> str:
     """Return the clause that names what speaks most against the pose."""
+    if not figures.converged:
+        return "the refinement on the points left the place that the search had found"
+    if figures.evidence < LEAST_EVIDENCE:
+        return (
+            f"the best pose has only {figures.evidence:.0f} nats of evidence, too little to rely "
+            f"on (at least {LEAST_EVIDENCE:.0f} are needed)"
+        )
     if told_apart(figures.second_ratio) < ACCEPT_AT:
         return (
             "another pose is nearly as good as the best one (evidence ratio "

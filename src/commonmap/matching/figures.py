@@ -19,6 +19,9 @@ from commonmap.matching.slabs import coarsen, list_columns
 from commonmap.matching.support import measure_support
 from commonmap.types import Bools, Float64s
 
+LOW = 0.3
+"""Metres above ground under which a point is the ground's."""
+
 CLEAR_BY = 4.0
 """How many times the score of the mirrored source's best pose, and of the best pose elsewhere, the
 score of a pose must be at a glance. Some other places reach more, but with a tenth of the score."""
@@ -68,7 +71,7 @@ def measure_figures(
 
 def lift_mirrored(T_planar: Float64s, base: Prepared, mirrored: Points) -> Float64s:
     """Return the planar motion of the mirrored source with z set by its ground."""
-    low = np.abs(mirrored.height) < 0.3
+    low = np.abs(mirrored.height) < LOW
     moved = apply(T_planar, sample_where(mirrored.xyz, low | ~low.any(), 20_000))
     lifted = T_planar.copy()
     lifted[2, 3] += float(np.median(base.ground.height_at(moved[:, :2]) - moved[:, 2]))

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from commonmap.frames import apply
 from commonmap.mapping.points import bounds, floor_int, sample_where
+from commonmap.matching.neighbours import sort_by_column
 from commonmap.types import Bools, Float64s
 
 MOST_POINTS = 20_000
@@ -51,39 +52,29 @@ def _count(
     n_y: int,
 ) -> tuple[int, int]:  # fmt: skip
     """Return how many draft points lie over known columns, and how many of them near a point."""
-    upright, starts, seen = _columns(np.ascontiguousarray(target), standing, low, reach, n_x, n_y)
-    known, near = _look(upright, starts, seen, np.ascontiguousarray(draft), low, reach, n_x, n_y)
+    cell = _columns(np.ascontiguousarray(target), low, reach, n_x, n_y)
+    seen = np.zeros(n_x * n_y + 1, np.bool_)
+    seen[cell] = True  # the last one gathers what lies outside
+    upright = np.flatnonzero(standing & (cell < n_x * n_y))
+    order, starts = sort_by_column(cell[upright], n_x * n_y)
+    known, near = _look(
+        target[upright[order]], starts, seen, np.ascontiguousarray(draft), low, reach, n_x, n_y
+    )
     return int(known), int(near)
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
 def _columns(
-    xyz: Float64s, standing: Bools, low: Float64s, size: float, n_x: int, n_y: int
-) -> tuple[Float64s, NDArray[np.int64], Bools]:  # pragma: no cover
-    """Return what stands, by the columns of an (n_x, n_y) grid, where each starts, which hold any.
-
-    starts: (n_x * n_y + 1,). The last column, n_x * n_y, gathers what lies outside: it holds all of
-    that, and what stands there is left out.
-    """
+    xyz: Float64s, low: Float64s, size: float, n_x: int, n_y: int
+) -> NDArray[np.int32]:  # pragma: no cover
+    """Return each point's cell of an (n_x, n_y) grid, n_x * n_y where it lies outside."""
     cell = np.empty(xyz.shape[0], np.int32)
-    seen = np.zeros(n_x * n_y + 1, np.bool_)
-    starts = np.zeros(n_x * n_y + 2, np.int64)
     for n in range(xyz.shape[0]):
         i = floor_int((xyz[n, 0] - low[0]) / size)
         j = floor_int((xyz[n, 1] - low[1]) / size)
         inside = 0 <= i < n_x and 0 <= j < n_y
         cell[n] = i * n_y + j if inside else n_x * n_y
-        seen[cell[n]] = True
-        if standing[n]:
-            starts[cell[n] + 1] += 1
-    starts = np.cumsum(starts)[:-1]
-    place, upright = starts.copy(), np.empty((starts[-1], 3))
-    for n in range(xyz.shape[0]):
-        c = cell[n]
-        if standing[n] and c < n_x * n_y:
-            upright[place[c]] = xyz[n]
-            place[c] += 1
-    return upright, starts, seen
+    return cell
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]

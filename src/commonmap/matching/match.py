@@ -23,7 +23,14 @@ from commonmap.matching.maps import (
     prepare,
 )
 from commonmap.matching.refine import Refined, lift
-from commonmap.matching.search import Peaks, centre_columns, plan_glance, plan_search, search
+from commonmap.matching.search import (
+    Peaks,
+    SearchPlan,
+    centre_columns,
+    plan_glance,
+    plan_search,
+    search,
+)
 from commonmap.matching.search_metric import search_metric
 from commonmap.matching.seen_free import know_by_rays
 from commonmap.matching.slabs import SlabGrid, coarsen, list_columns, scatter
@@ -129,28 +136,9 @@ def _search_both(
 ) -> tuple[Peaks, Peaks]:
     """Return the best poses of the source as it is, and of the mirrored source.
 
-    At a glance where that tells, else of the whole search.
+    At a glance where that tells, else of the whole search. Raises EmptyMapError where nothing
+    stands on one of the maps.
     """
-    if METRICS[config.search.metric].layers == "slabs":
-        found, decoy = (
-            _search(base, draft, config, mirrored, timings, progress, glance=True)
-            for mirrored in (False, True)
-        )
-        if is_told_at_a_glance(found, decoy):
-            return found, decoy
-    found, decoy = (
-        _search(base, draft, config, mirrored, timings, progress) for mirrored in (False, True)
-    )
-    return found, decoy
-
-
-def _search(
-    base: Layers, draft: Layers, config: Config, mirrored: bool, timings: dict[str, float],
-    progress: Progress, *, glance: bool = False,
-) -> Peaks:  # fmt: skip
-    def tell(step: str, share: float = 0.0) -> None:
-        progress("search the mirrored map" if mirrored else step, share)
-
     if not draft.grid["slab_occupied"].any() or not base.grid["slab_occupied"].any():
         side = "source" if not draft.grid["slab_occupied"].any() else "target"
         raise EmptyMapError(
@@ -158,9 +146,33 @@ def _search(
             f"{base.grid.slab_edges[0]:.2g} and {base.grid.slab_edges[-1]:.2g} m; "  # type: ignore[index]
             "there is nothing to match"
         )
+
+    def by(plan: SearchPlan | None) -> tuple[Peaks, Peaks]:
+        found, decoy = (
+            _search(base, draft, config, plan, mirrored, timings, progress)
+            for mirrored in (False, True)
+        )
+        return found, decoy
+
+    if METRICS[config.search.metric].layers != "slabs":
+        return by(None)
+    glance = by(plan_glance(base.slabs, draft.slabs))
+    if is_told_at_a_glance(*glance):
+        return glance
+    return by(plan_search(base.slabs, draft.slabs))
+
+
+def _search(
+    base: Layers, draft: Layers, config: Config, plan: SearchPlan | None, mirrored: bool,
+    timings: dict[str, float], progress: Progress,
+) -> Peaks:  # fmt: skip
+    """Return the best poses by the metric; plan: of a search on slabs."""
+
+    def tell(step: str, share: float = 0.0) -> None:
+        progress("search the mirrored map" if mirrored else step, share)
+
     with _timed(timings, "decoy" if mirrored else "search"):
-        if METRICS[config.search.metric].layers == "slabs":
-            plan = (plan_glance if glance else plan_search)(base.slabs, draft.slabs)
+        if plan is not None:
             return search(
                 base.slabs, draft.slabs, min_overlap=least_overlap(config), mirrored=mirrored,
                 plan=plan, workers=WORKERS, compute=config.compute, progress=tell,

@@ -58,10 +58,20 @@ def index_points(xyz: Float64s, spacing: float) -> PlanIndex:
         size *= 1.5
     n_x, n_y = (int(n) + 1 for n in np.floor(extent / size))
     column = _columns(np.ascontiguousarray(xyz), low, size, n_x, n_y)
-    starts = np.zeros(n_x * n_y + 1, np.int64)
-    np.cumsum(np.bincount(column, minlength=n_x * n_y), out=starts[1:])
-    order = _order_by(column, starts)
+    order, starts = sort_by_column(column, n_x * n_y)
     return PlanIndex(xyz[order], order, starts, low[:2], size, (n_x, n_y))
+
+
+def sort_by_column(
+    column: NDArray[np.int32], n_columns: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the order of points by their columns, and where each column begins (n_columns + 1,).
+
+    Those of one column stay in the order that they came in.
+    """
+    starts = np.zeros(n_columns + 1, np.int64)
+    np.cumsum(np.bincount(column, minlength=n_columns), out=starts[1:])
+    return np.asarray(_order_by(column, starts)), starts
 
 
 class Normals:

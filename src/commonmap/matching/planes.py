@@ -26,26 +26,8 @@ def pack_planes(bits: Bits, n_slabs: int, pad: int, *, alone: bool = False) -> W
     n_words = (bits.shape[1] + 63) // 64 + 2 * pad
     n_planes = 1 if alone else -(-n_slabs // WIDTH) * WIDTH
     out = np.zeros((bits.shape[0], n_words, n_planes), np.uint64)
-    _fill_planes(np.ascontiguousarray(bits, np.uint32), n_slabs, pad, out)
+    _fill_planes(np.ascontiguousarray(bits, np.uint32), pad, out)
     return out
-
-
-@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
-def _fill_planes(bits, n_slabs, pad, out):  # type: ignore[no-untyped-def]
-    for i in range(bits.shape[0]):
-        for j in range(bits.shape[1]):
-            _set_planes(out, i, 64 * pad + j, bits[i, j], n_slabs)
-
-
-@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
-def _set_planes(planes, i, j, bits, n_slabs):  # type: ignore[no-untyped-def]
-    """Set cell [i, j] of the planes of all slabs that are in the bits."""
-    cell, k = np.uint64(1) << np.uint64(j & 63), 0
-    while bits != 0 and k < n_slabs:
-        if bits & np.uint32(1):
-            planes[i, j >> 6, k] |= cell
-        bits >>= np.uint32(1)
-        k += 1
 
 
 def _mask_table() -> Words:
@@ -55,6 +37,32 @@ def _mask_table() -> Words:
 
 
 MASKS = _mask_table()
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _fill_planes(bits, pad, out):  # type: ignore[no-untyped-def]
+    n_words, n_planes, words, masks = out.shape[1], out.shape[2], out.reshape(-1), MASKS
+    for i in range(bits.shape[0]):
+        for j in range(bits.shape[1]):
+            word = i * n_words + pad + (j >> 6)
+            bit = np.uint64(1) << np.uint64(j & 63)
+            _set_planes(words, word * n_planes, bit, bits[i, j], n_planes, masks)
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _set_planes(words, at, bit, bits, n_planes, masks):  # type: ignore[no-untyped-def]
+    """Set a bit of the words that begin at `at`, one a plane, of all slabs that are in `bits`.
+
+    One plane alone takes the first slab.
+    """
+    if n_planes == 1:
+        if bits & np.uint32(1):
+            words[at] |= bit
+        return
+    for g in range(0, n_planes, WIDTH):
+        which = np.int64((bits >> np.uint32(g)) & np.uint32(255)) * WIDTH
+        if which:
+            store(words, at + g, load(words, at + g) | (load(masks, which) & bit))
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
@@ -117,7 +125,7 @@ def count_planes(s_occupied, s_known, t_occupied, t_known, i0, j0, pad, counts):
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
 def turn_planes(  # type: ignore[no-untyped-def]
-    xy, s_occupied, s_known, n_slabs, yaw, cell, x, y, half_o, half_k, out_occupied, out_known
+    xy, s_occupied, s_known, yaw, cell, x, y, half_o, half_k, out_occupied, out_known
 ):
     """Fill the planes of the source turned by `yaw`, for the four ways to pair up half cells.
 
@@ -138,31 +146,17 @@ def turn_planes(  # type: ignore[no-untyped-def]
         h[n] = floor_int((cosine * xs[n] - sine * ys[n]) * scale + 2.0 * x)
         v[n] = floor_int((sine * xs[n] + cosine * ys[n]) * scale + 2.0 * y)
     masks, words_o, words_k = MASKS, half_o.reshape(-1), half_k.reshape(-1)
-    shared = half_k.shape[2] == 1
+    n_planes, n_known = half_o.shape[2], half_k.shape[2]
     for n in range(xs.shape[0]):
         j = v[n] + side - 1
         word, bit = (h[n] + side - 1) * n_words + (j >> 6), np.uint64(1) << np.uint64(j & 63)
-        _set_lanes(words_o, word * half_o.shape[2], bit, s_occupied[n], n_slabs, masks)
-        if not shared:
-            _set_lanes(words_k, word * half_k.shape[2], bit, s_known[n], n_slabs, masks)
-        elif s_known[n] & np.uint32(1):
-            words_k[word] |= bit
+        _set_planes(words_o, word * n_planes, bit, s_occupied[n], n_planes, masks)
+        _set_planes(words_k, word * n_known, bit, s_known[n], n_known, masks)
     _pair_up_lanes(half_o, out_occupied)
-    if shared:
+    if n_known == 1:
         _pair_up_words(half_k, out_known)
     else:
         _pair_up_lanes(half_k, out_known)
-
-
-@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
-def _set_lanes(words, at, bit, bits, n_slabs, masks):  # type: ignore[no-untyped-def]
-    """Set a bit of the words that begin at `at`, one a slab, of all slabs that are in `bits`."""
-    g = 0
-    while bits != 0 and g < n_slabs:
-        which = np.int64(bits & np.uint32(255)) * WIDTH
-        store(words, at + g, load(words, at + g) | (load(masks, which) & bit))
-        bits >>= np.uint32(8)
-        g += WIDTH
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]

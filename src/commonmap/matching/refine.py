@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from commonmap.frames import apply, from_rotation
 from commonmap.mapping.ground import Ground
-from commonmap.mapping.points import bounds, inside_box, move, sample, thin
+from commonmap.mapping.points import bounds, inside_box, move, rows_of, sample, thin
 from commonmap.matching.covariance import Pairs, Surface, measure_covariance, pair_points
 from commonmap.matching.neighbours import Normals, index_points
 from commonmap.types import Float64s
@@ -121,7 +121,7 @@ def refine(
     centre = 0.5 * (low + high)
     voxel = max(cell / 3.0, 0.03)
     fine = max(0.05, 0.3 * voxel)
-    target, source = target_xyz[inside] - centre, moved_source - centre
+    target, source = rows_of(target_xyz, inside) - centre, moved_source - centre
     if settle:
         target, source = (
             thin(xyz, max(fine, apart * math.sqrt(len(xyz) / most)), most)

@@ -12,6 +12,7 @@ import numpy as np
 from commonmap.mapping.points import move, sample_where
 from commonmap.matching.decide import Figures, is_open, rank_value
 from commonmap.matching.figures import (
+    LOW,
     lift_mirrored,
     measure_figures,
     measure_inliers,
@@ -39,9 +40,6 @@ CLOSE = 0.64
 
 MOST_RIVALS = 4
 """Peaks that are looked at on the points."""
-
-LOW = 0.3
-"""Metres above ground under which a point is the ground's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,9 +175,8 @@ def look_mirrored(
     mirrored = mirror(points, decoy)
     T = lift_mirrored(decoy.T_target_source(), base, mirrored)
     there = near(move(T, mirrored.xyz))
-    refined = refine(there.xyz, mirrored.xyz, T, cell=max(cell, decoy.cell), apart=points.voxel,
-        settle=False,
-    )  # fmt: skip
+    searched = max(cell, decoy.cell)
+    refined = refine(there.xyz, mirrored.xyz, T, cell=searched, apart=points.voxel, settle=False)
     return Look(
         refined,
         measure_inliers(there, mirrored, refined.T_target_source, cell),
