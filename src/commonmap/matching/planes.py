@@ -46,23 +46,20 @@ def _fill_planes(bits, pad, out):  # type: ignore[no-untyped-def]
         for j in range(bits.shape[1]):
             word = i * n_words + pad + (j >> 6)
             bit = np.uint64(1) << np.uint64(j & 63)
-            _set_planes(words, word * n_planes, bit, bits[i, j], n_planes, masks)
+            if n_planes > 1:
+                _set_lanes(words, word * n_planes, bit, bits[i, j], masks)
+            elif bits[i, j] & np.uint32(1):
+                words[word] |= bit
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
-def _set_planes(words, at, bit, bits, n_planes, masks):  # type: ignore[no-untyped-def]
-    """Set a bit of the words that begin at `at`, one a plane, of all slabs that are in `bits`.
-
-    One plane alone takes the first slab.
-    """
-    if n_planes == 1:
-        if bits & np.uint32(1):
-            words[at] |= bit
-        return
-    for g in range(0, n_planes, WIDTH):
-        which = np.int64((bits >> np.uint32(g)) & np.uint32(255)) * WIDTH
-        if which:
-            store(words, at + g, load(words, at + g) | (load(masks, which) & bit))
+def _set_lanes(words, at, bit, bits, masks):  # type: ignore[no-untyped-def]
+    """Set a bit of the words that begin at `at`, one a plane, of all slabs that are in `bits`."""
+    while bits != 0:
+        which = np.int64(bits & np.uint32(255)) * WIDTH
+        store(words, at, load(words, at) | (load(masks, which) & bit))
+        bits >>= np.uint32(8)
+        at += WIDTH
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
@@ -150,8 +147,11 @@ def turn_planes(  # type: ignore[no-untyped-def]
     for n in range(xs.shape[0]):
         j = v[n] + side - 1
         word, bit = (h[n] + side - 1) * n_words + (j >> 6), np.uint64(1) << np.uint64(j & 63)
-        _set_planes(words_o, word * n_planes, bit, s_occupied[n], n_planes, masks)
-        _set_planes(words_k, word * n_known, bit, s_known[n], n_known, masks)
+        _set_lanes(words_o, word * n_planes, bit, s_occupied[n], masks)
+        if n_known > 1:
+            _set_lanes(words_k, word * n_known, bit, s_known[n], masks)
+        elif s_known[n] & np.uint32(1):
+            words_k[word] |= bit
     _pair_up_lanes(half_o, out_occupied)
     if n_known == 1:
         _pair_up_words(half_k, out_known)
