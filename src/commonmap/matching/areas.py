@@ -34,6 +34,7 @@ from commonmap.matching.figures import (
     other_poses,
 )
 from commonmap.matching.maps import (
+    MOST_POINTS,
     Layers,
     Points,
     Prepared,
@@ -42,10 +43,17 @@ from commonmap.matching.maps import (
     choose_points,
     prepare,
 )
-from commonmap.matching.refine import lift, refine
+from commonmap.matching.refine import lift, settle, walk
 from commonmap.matching.search import Peaks, search
 from commonmap.matching.slabs import SlabGrid
-from commonmap.matching.verify import look_at, look_mirrored, with_looks
+from commonmap.matching.verify import (
+    Target,
+    find_source,
+    find_target,
+    look_at,
+    look_mirrored,
+    with_looks,
+)
 from commonmap.types import (
     Area,
     Areas,
@@ -143,7 +151,7 @@ def match_areas(
     tiling = tile(points.xyz, max(round(config.areas.size / half), 1) * half)
 
     # 3. each by itself on the whole base: pose, score and verdict
-    there = choose_points(base, cell, edges, max_height)
+    there = find_target(choose_points(base, cell, edges, max_height), cell, n_most=MOST_POINTS)
     alone = []
     area_of = tiling.find(points.xyz)
     for n, ij in enumerate(tiling.ij):
@@ -182,7 +190,7 @@ class Alone:
 
 
 def _match_alone(
-    base: Prepared, draft: Prepared, layers: tuple[Layers, Layers], there: Points, own: Points,
+    base: Prepared, draft: Prepared, layers: tuple[Layers, Layers], there: Target, own: Points,
     ij: Index, size: float, cell: float,
 ) -> Alone | None:  # fmt: skip
     """Return an area's own match on the whole base, None where too little stands in it."""
@@ -196,14 +204,15 @@ def _match_alone(
         return None
     decoy = search(layers[0].slabs, slabs, min_overlap=LEAST_OVERLAP, mirrored=True)
     T = lift(found.T_target_source(), base.ground, draft.ground)
-    refined = refine(
-        there.xyz, own.xyz, T, cell=max(cell, found.cell), n_most=16_000, apart=own.voxel
-    )
+    source = find_source(own, cell)
+    way = walk(there.surface, source.walkers, T, cell=cell)
+    refined = settle(way, there.points.xyz, own.xyz, n_most=16_000, apart=own.voxel)
     part = Layers(layers[1].grid, slabs)
     figures = with_looks(
-        measure_figures(layers[0], part, found, found, decoy, refined, cell),
-        look_at(base, there, own, refined, cell),
-        look_mirrored(base, lambda placed: there, own, decoy, cell),
+        measure_figures(layers[0], part, found, found, decoy, cell),
+        look_at(base, there, source, way, refined, cell),
+        look_mirrored(base, lambda placed, T: there, source, decoy, cell),
+        cell,
     )
     return Alone(found, refined.T_target_source, decide(figures))
 

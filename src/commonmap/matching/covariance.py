@@ -13,7 +13,7 @@ is not there. K is measured instead: the pulls at poses moved a little, each wit
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numba
 import numpy as np
@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from commonmap.frames import from_rotation
 from commonmap.mapping.points import move, sample
-from commonmap.matching.neighbours import Normals
+from commonmap.matching.neighbours import Normals, PlanIndex
 from commonmap.types import Float64s
 
 STEP = 2.0
@@ -52,11 +52,19 @@ other's on the other. Such a shift is common to all patches, so none of them tel
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A target to register on. points, normals: (N, 3) or on demand. tree: of the points."""
+    """A target to register on. points, normals: (N, 3) or on demand. tree: of the points.
+
+    origin: (3,) of the frame that it is seen in, in the frame of the points.
+    """
 
     points: Float64s
     normals: Float64s | Normals
-    tree: cKDTree
+    tree: cKDTree | PlanIndex
+    origin: Float64s = field(default_factory=lambda: np.zeros(3))
+
+    def about(self, origin: Float64s) -> Surface:
+        """Return the surface as seen from another origin (3,), in the frame of its points."""
+        return replace(self, origin=np.asarray(origin, dtype=np.float64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +102,7 @@ def pair_points(
 
     Residual `r = n . (T p - q)`, Cauchy weights of the given scale or their own, metres.
     """
-    moved = move(T, source)
+    moved = move(from_rotation(np.eye(3), surface.origin) @ T, source)
     _, index = surface.tree.query(moved, distance_upper_bound=reach, workers=1)
     hit = np.flatnonzero(index < len(surface.points))
     if len(hit) < 20:
@@ -102,7 +110,7 @@ def pair_points(
     on, normals = index[hit], surface.normals
     if isinstance(normals, Normals):
         normals = normals.at_least(on)
-    p, J, r = _lay_on(moved, hit, surface.points, normals, on)
+    p, J, r = _lay_on(moved, surface.origin, hit, surface.points, normals, on)
     if scale is None:
         scale = max(1.4826 * float(np.median(np.abs(r))), 0.01)
     w = 1.0 / (1.0 + (r / (2.0 * scale)) ** 2)
@@ -110,16 +118,17 @@ def pair_points(
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
-def _lay_on(moved, hit, points, normals, on):  # type: ignore[no-untyped-def]
+def _lay_on(moved, origin, hit, points, normals, on):  # type: ignore[no-untyped-def]
     """Return p (M, 3), J (M, 6) and r (M,) of the points `hit`, each on one of a surface's."""
     p, J, r = np.empty((hit.shape[0], 3)), np.empty((hit.shape[0], 6)), np.empty(hit.shape[0])
     for k in range(hit.shape[0]):
         x, y, z = moved[hit[k], 0], moved[hit[k], 1], moved[hit[k], 2]
         q, n = points[on[k]], normals[on[k]]
+        r[k] = n[0] * (x - q[0]) + n[1] * (y - q[1]) + n[2] * (z - q[2])
+        x, y, z = x - origin[0], y - origin[1], z - origin[2]
         p[k, 0], p[k, 1], p[k, 2] = x, y, z
         J[k, 0], J[k, 1], J[k, 2] = n[0], n[1], n[2]
         J[k, 3], J[k, 4], J[k, 5] = y * n[2] - z * n[1], z * n[0] - x * n[2], x * n[1] - y * n[0]
-        r[k] = n[0] * (x - q[0]) + n[1] * (y - q[1]) + n[2] * (z - q[2])
     return p, J, r
 
 

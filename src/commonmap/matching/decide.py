@@ -158,12 +158,12 @@ def is_open(figures: Figures) -> bool:
     open, and that matters from `HOPELESS` on.
     """
     first = at_first_look(figures)
-    if _is_lost(figures) and decide(first).confidence < HOPELESS:
+    if is_lost(figures) and decide(first).confidence < HOPELESS:
         return False
     return OPEN[0] < probability(first) < OPEN[1]
 
 
-def _is_lost(figures: Figures) -> bool:
+def is_lost(figures: Figures) -> bool:
     """Return whether something refuses the pose that no probability makes up for."""
     return (
         not _is_held(figures)
@@ -191,7 +191,7 @@ def decide(figures: Figures) -> Verdict:
     confidence = min(probability(figures), told_apart(figures.second_ratio))
     if not _is_held(figures):
         confidence = min(confidence, 0.5)
-    if confidence >= ACCEPT_AT and not _is_lost(figures):
+    if confidence >= ACCEPT_AT and not is_lost(figures):
         return Verdict(
             True,
             confidence,

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,7 +11,6 @@ from commonmap.mapping.points import sample_where
 from commonmap.matching.decide import Figures
 from commonmap.matching.inliers import share_of_inliers
 from commonmap.matching.maps import Layers, Points, Prepared
-from commonmap.matching.refine import Refined
 from commonmap.matching.search import Peaks, centre_columns, evidence_at
 from commonmap.matching.slabs import coarsen, list_columns
 from commonmap.matching.support import measure_support
@@ -33,7 +30,7 @@ four times above chance came to 72 at most (docs/matching.md)."""
 
 def measure_figures(
     base_layers: Layers, draft_layers: Layers, found: Peaks, witness: Peaks, decoy: Peaks,
-    refined: Refined, cell: float,
+    cell: float,
 ) -> Figures:  # fmt: skip
     """Return what the verdict on the best pose of `found` rests on.
 
@@ -64,8 +61,8 @@ def measure_figures(
         decoy_inliers=0.0,
         overlap=float(found.overlap[0]),
         n_overlap=float(best.n_pairs),
-        moved=refined.moved[0] / cell,
-        converged=float(refined.converged),
+        moved=0.0,
+        converged=1.0,
     )
 
 
@@ -107,8 +104,8 @@ def measure_inliers(base: Points, draft: Points, T_target_source: Float64s, cell
     )
 
 
-def mirror(draft: Points, decoy: Peaks) -> Points:
-    """Return the points reflected (x -> -x) about the centre of the source, as the decoy was."""
-    xyz = draft.xyz.copy()
-    xyz[:, 0] = 2.0 * decoy.centre[0] - xyz[:, 0]
-    return replace(draft, xyz=xyz)
+def mirror(decoy: Peaks) -> Float64s:
+    """Return the reflection (4, 4) of the source's points (x -> -x about its centre)."""
+    T = np.diag([-1.0, 1.0, 1.0, 1.0])
+    T[0, 3] = 2.0 * decoy.centre[0]
+    return T

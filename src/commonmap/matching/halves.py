@@ -10,7 +10,15 @@ from __future__ import annotations
 import numpy as np
 
 from commonmap.matching.figures import other_poses
-from commonmap.matching.search import Peaks, centre_columns, evidence_at, search
+from commonmap.matching.search import (
+    BUDGET,
+    KEEP,
+    Peaks,
+    centre_columns,
+    evidence_at,
+    plan_search,
+    search,
+)
 from commonmap.matching.slabs import Columns, SlabGrid, coarsen, list_columns
 from commonmap.types import Bools, Float64s
 
@@ -81,7 +89,8 @@ def _ratio(
     target: SlabGrid, grid: SlabGrid, half: SlabGrid, found: Peaks, cell: float, workers: int
 ) -> float:
     """Return the half's best evidence near the pose of `found` over its best anywhere else."""
-    peaks = search(target, half, min_overlap=HALF_OVERLAP, workers=workers)
+    plan = plan_search(target, half, budget=BUDGET / 4.0, keep=KEEP // 4)
+    peaks = search(target, half, min_overlap=HALF_OVERLAP, plan=plan, workers=workers)
     middle = found.T_target_source() @ np.array([*peaks.centre, 0.0, 1.0])
     pose = np.array([*middle[:2], found.pose[0, 2]])
     here = evidence_at(

@@ -135,11 +135,6 @@ def choose_points(
     return Points(xyz, height, height > edges[0], voxel)
 
 
-def points_around(points: Points, around: Float64s, cell: float) -> Points:
-    """Return the points within three cells of the plan of (K, 3) points, metres."""
-    return points.where(_is_around(points.xyz, around, cell))
-
-
 def _is_around(xyz: Float64s, around: Float64s, cell: float) -> Bools:
     low, high = bounds(around)
     return inside_box(xyz, (low - 3.0 * cell)[:2], (high + 3.0 * cell)[:2])

@@ -109,10 +109,12 @@ def match(
     if len(found.score):
         with _timed(timings, "refine"):
             progress("refine")
-            maps = Maps(base, draft, base_layers, draft_layers, cell, edges, max_height)
+            searched = max(cell, found.cell)
+            maps = Maps(base, draft, base_layers, draft_layers, cell, edges, max_height, searched)
             found, refined, figures = verify(
-                maps, found, witness, witness_decoy, on_evidence=witness is found, workers=WORKERS
-            )
+                maps, found, witness, witness_decoy, on_evidence=witness is found,
+                sure=config.decide.mode == "off", workers=WORKERS,
+            )  # fmt: skip
 
     # 5. believe it or not
     with _timed(timings, "decide"):
@@ -215,7 +217,8 @@ def _answer(
         if accepted:
             T = best
             R = np.kron(np.eye(2), T_map_prepared[:3, :3])
-            covariance = R @ refined.covariance @ R.T
+            with _timed(timings, "refine"):
+                covariance = R @ refined.covariance @ R.T
             centre = apply(T_map_prepared, refined.centre[None])[0]
         else:
             own = Candidate(best, float(score[0]), float(found.overlap[0]))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from threading import Lock
 
 import numba
 import numpy as np
@@ -25,7 +26,8 @@ class PlanIndex:
     """Points by columns of the plan. points: (N, 3) metres, in the order of their columns.
 
     number: (N,) index of each in the array that came in. starts: (nx * ny + 1,) where each column
-    begins. low: (2,) corner of the first. size: metres, of a column.
+    begins. low: (2,) corner of the first. size: metres, of a column. gap: (nx * ny,) how many
+    squares of columns about each, itself the first, hold nothing, 255 at most.
     """
 
     points: Float64s
@@ -34,6 +36,7 @@ class PlanIndex:
     low: Float64s
     size: float
     shape: tuple[int, int]
+    gap: NDArray[np.uint8]
 
     def query(
         self, xyz: Float64s, *, distance_upper_bound: float = math.inf, workers: int = 1
@@ -43,7 +46,7 @@ class PlanIndex:
         Where none is nearer than the bound: infinity, and the number of points. One thread.
         """
         distance, index = _query(
-            self.points, self.number, self.starts, self.low, self.size, *self.shape,
+            self.points, self.number, self.starts, self.gap, self.low, self.size, *self.shape,
             np.ascontiguousarray(xyz, dtype=np.float64), distance_upper_bound,
         )  # fmt: skip
         return distance, index
@@ -59,7 +62,8 @@ def index_points(xyz: Float64s, spacing: float) -> PlanIndex:
     n_x, n_y = (int(n) + 1 for n in np.floor(extent / size))
     column = _columns(np.ascontiguousarray(xyz), low, size, n_x, n_y)
     order, starts = sort_by_column(column, n_x * n_y)
-    return PlanIndex(xyz[order], order, starts, low[:2], size, (n_x, n_y))
+    gap = _gaps(starts, n_x, n_y)
+    return PlanIndex(xyz[order], order, starts, low[:2], size, (n_x, n_y), gap)
 
 
 def sort_by_column(
@@ -74,11 +78,37 @@ def sort_by_column(
     return np.asarray(_order_by(column, starts)), starts
 
 
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _gaps(starts, n_x, n_y):  # type: ignore[no-untyped-def]
+    """Return the distance, in columns along the longer way, to the nearest that holds a point."""
+    gap = np.empty((n_x, n_y), np.uint8)
+    most = np.uint8(255)
+    for i in range(n_x):  # from what lies before, then from what lies behind
+        for j in range(n_y):
+            c = i * n_y + j
+            if starts[c + 1] > starts[c]:
+                gap[i, j] = 0
+                continue
+            near = gap[i, j - 1] if j > 0 else most
+            if i > 0:
+                for k in range(max(j - 1, 0), min(j + 2, n_y)):
+                    near = min(near, gap[i - 1, k])
+            gap[i, j] = near + np.uint8(near < most)
+    for i in range(n_x - 1, -1, -1):
+        for j in range(n_y - 1, -1, -1):
+            near = gap[i, j + 1] if j + 1 < n_y else most
+            if i + 1 < n_x:
+                for k in range(max(j - 1, 0), min(j + 2, n_y)):
+                    near = min(near, gap[i + 1, k])
+            gap[i, j] = min(gap[i, j], near + np.uint8(near < most))
+    return gap.ravel()
+
+
 class Normals:
     """The unit normals of the points of an index, worked out as they are asked for.
 
     Of each point's `n_neighbours` nearest, itself among them: across their thinnest direction.
-    `normals[which]` are the (M, 3) of (M,) points, numbered as they came in. One thread.
+    `normals[which]` are the (M, 3) of (M,) points, numbered as they came in. Threads may share it.
     """
 
     def __init__(self, index: PlanIndex, n_neighbours: int) -> None:
@@ -89,6 +119,7 @@ class Normals:
         self.index, self.n_neighbours = index, n_neighbours
         self._normal = np.empty_like(index.points)
         self._found = np.zeros(len(index.points), dtype=bool)
+        self._one = Lock()
 
     def __getitem__(self, which: NDArray[np.int64]) -> Float64s:
         return np.asarray(self.at_least(which)[which])
@@ -97,14 +128,15 @@ class Normals:
         """Return the normals (N, 3) of all points; only those of (M,) points must be right."""
         wanted = np.zeros(len(self._found), dtype=bool)
         wanted[which] = True
-        wanted &= ~self._found
-        if wanted.any():
-            index = self.index
-            _find_normals(
-                index.points, index.number, index.starts, index.low, index.size, *index.shape,
-                self.n_neighbours, wanted, self._normal,
-            )  # fmt: skip
-            self._found |= wanted
+        with self._one:
+            wanted &= ~self._found
+            if wanted.any():
+                index = self.index
+                _find_normals(
+                    index.points, index.number, index.starts, index.low, index.size, *index.shape,
+                    self.n_neighbours, wanted, self._normal,
+                )  # fmt: skip
+                self._found |= wanted
         return self._normal
 
 
@@ -129,7 +161,9 @@ def _order_by(column, starts):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
-def _query(points, number, starts, low, size, n_x, n_y, xyz, reach):  # type: ignore[no-untyped-def]
+def _query(  # type: ignore[no-untyped-def]
+    points, number, starts, gap, low, size, n_x, n_y, xyz, reach
+):
     distance = np.full(xyz.shape[0], np.inf)
     index = np.full(xyz.shape[0], points.shape[0], np.int64)
     most = reach * reach
@@ -140,8 +174,10 @@ def _query(points, number, starts, low, size, n_x, n_y, xyz, reach):  # type: ig
         # how far the border of the point's own column is, at the nearest
         inner = min(min(u - i0, i0 + 1.0 - u), min(v - j0, j0 + 1.0 - v)) * size
         nearest, best = most, -1
-        # squares that lie wholly beside the grid are passed over
+        # squares that lie wholly beside the grid, or hold nothing, are passed over
         ring = max(0, max(max(-i0, i0 - n_x + 1), max(-j0, j0 - n_y + 1)))
+        if ring == 0:
+            ring = int(gap[i0 * n_y + j0])
         last = max(max(i0, n_x - 1 - i0), max(j0, n_y - 1 - j0))
         while ring <= last:
             bound = inner + (ring - 1) * size if ring > 0 else 0.0
