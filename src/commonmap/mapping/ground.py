@@ -139,8 +139,9 @@ def _fit_plane(z: Float64s, known: Bools) -> tuple[float, float, float]:
     w = np.ones(len(at))
     x: Float64s = np.zeros(3)
     for _ in range(4):
-        N = (A * w[:, None]).T @ A + 1e-9 * len(at) * np.eye(3)
-        x = np.asarray(np.linalg.solve(N, (A * w[:, None]).T @ b), dtype=np.float64)
+        weighted = (A * w[:, None]).T
+        N = weighted @ A + 1e-9 * len(at) * np.eye(3)
+        x = np.asarray(np.linalg.solve(N, weighted @ b), dtype=np.float64)
         residual = b - A @ x
         scale = 1.4826 * float(np.median(np.abs(residual))) + 1e-3
         w = 1.0 / (1.0 + (residual / (2.0 * scale)) ** 2)

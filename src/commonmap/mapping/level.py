@@ -67,7 +67,7 @@ def find_level(xyz: Float64s) -> Levelling:
     if len(xyz) < 200:
         return no_levelling("too few points to tell which way is up")
     centred = sample(xyz, MOST_POINTS)
-    centred = centred - np.median(sample(centred, 20_000), axis=0)
+    centred = move(from_rotation(np.eye(3), -np.median(sample(centred, 20_000), axis=0)), centred)
 
     # Roughly up: the map's own z, unless another direction has ground under everything
     up, own = _rough_up(centred)

@@ -12,8 +12,6 @@ all poses of its yaw.
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +19,7 @@ from numpy.typing import NDArray
 from commonmap.matching.evidence import sum_table, weigh, xlogx_table
 from commonmap.matching.planes import Words, count_planes, pack_planes, turn_planes
 from commonmap.matching.slabs import Columns, SlabGrid, is_shared
+from commonmap.matching.threads import in_order
 from commonmap.matching.tiles import Level
 from commonmap.types import Float64s
 
@@ -91,8 +90,7 @@ def climb_all(
         )  # fmt: skip
 
     rows = np.empty((len(pose), 5))
-    with ThreadPoolExecutor(max_workers=workers) as pool:
-        rows[order] = np.concatenate([np.zeros((0, 5)), *pool.map(climb, blocks)])
+    rows[order] = np.concatenate([np.zeros((0, 5)), *in_order(climb, blocks, workers)])
     return rows[:, :3], rows[:, 3], rows[:, 4]
 
 

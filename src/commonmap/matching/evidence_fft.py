@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from itertools import zip_longest
 from typing import Any
 
@@ -284,6 +284,7 @@ class Lanes:
     overlaps: NDArray[np.int64]
 
 
+@lru_cache(maxsize=64)
 def plan_lanes(
     standing: tuple[bool, ...], target_standing: tuple[bool, ...], shared: bool, target_shared: bool
 ) -> Lanes:

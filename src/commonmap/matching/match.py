@@ -34,7 +34,8 @@ from commonmap.matching.search import (
 from commonmap.matching.search_metric import search_metric
 from commonmap.matching.seen_free import know_by_rays
 from commonmap.matching.slabs import SlabGrid, coarsen, list_columns, scatter
-from commonmap.matching.verify import Maps, both, verify
+from commonmap.matching.threads import both, count_cores
+from commonmap.matching.verify import Maps, verify
 from commonmap.metrics.table import METRICS
 from commonmap.types import (
     Candidate,
@@ -47,7 +48,7 @@ from commonmap.types import (
     no_progress,
 )
 
-WORKERS = 2
+WORKERS = count_cores(2)
 """Threads; the answer does not depend on them."""
 
 
@@ -74,7 +75,9 @@ def match(
     with _timed(timings, "prepare"):
         progress("prepare the maps")
         base, draft = both(
-            lambda: prepare(target, "target", config), lambda: prepare(source, "source", config)
+            lambda: prepare(target, "target", config),
+            lambda: prepare(source, "source", config),
+            WORKERS,
         )
 
     # 2. height slabs of both on one cell size, taken from the data
@@ -84,6 +87,7 @@ def match(
         base_layers, draft_layers = both(
             lambda: build_layers(base, cell, edges, max_height),
             lambda: build_layers(draft, cell, edges, max_height),
+            WORKERS,
         )
     if config.grid.rays:
         with _timed(timings, "rays"):
@@ -91,6 +95,7 @@ def match(
             base_layers, draft_layers = both(
                 lambda: know_by_rays(base_layers, target, base),
                 lambda: know_by_rays(draft_layers, source, draft),
+                WORKERS,
             )
 
     # 3. every x, y and yaw; and again with the source mirrored

@@ -119,6 +119,8 @@ class Normals:
         self.index, self.n_neighbours = index, n_neighbours
         self._normal = np.empty_like(index.points)
         self._found = np.zeros(len(index.points), dtype=bool)
+        self._place = np.empty_like(index.number)
+        self._place[index.number] = np.arange(len(index.number))
         self._one = Lock()
 
     def __getitem__(self, which: NDArray[np.int64]) -> Float64s:
@@ -126,17 +128,12 @@ class Normals:
 
     def at_least(self, which: NDArray[np.int64]) -> Float64s:
         """Return the normals (N, 3) of all points; only those of (M,) points must be right."""
-        wanted = np.zeros(len(self._found), dtype=bool)
-        wanted[which] = True
+        index = self.index
         with self._one:
-            wanted &= ~self._found
-            if wanted.any():
-                index = self.index
-                _find_normals(
-                    index.points, index.number, index.starts, index.low, index.size, *index.shape,
-                    self.n_neighbours, wanted, self._normal,
-                )  # fmt: skip
-                self._found |= wanted
+            _find_normals(
+                index.points, self._place, index.starts, index.low, index.size, *index.shape,
+                self.n_neighbours, which, self._found, self._normal,
+            )  # fmt: skip
         return self._normal
 
 
@@ -206,14 +203,19 @@ def _query(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
 def _find_normals(  # type: ignore[no-untyped-def]
-    points, number, starts, low, size, n_x, n_y, n_neighbours, wanted, out
+    points, place, starts, low, size, n_x, n_y, n_neighbours, which, done, out
 ):
-    """Set the normals (N, 3) of the points that are wanted, as they are numbered."""
+    """Set the normals (N, 3) of (M,) points, as they are numbered, that are not `done` yet.
+
+    place: (N,) where each of them is in `points`.
+    """
     square = np.empty(MOST_NEIGHBOURS)
     near = np.empty(MOST_NEIGHBOURS, np.int64)
-    for n in range(points.shape[0]):
-        if not wanted[number[n]]:
+    for one in which:
+        if done[one]:
             continue
+        done[one] = True
+        n = place[one]
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
         i0 = min(int((x - low[0]) / size), n_x - 1)
         j0 = min(int((y - low[1]) / size), n_y - 1)
@@ -240,15 +242,15 @@ def _find_normals(  # type: ignore[no-untyped-def]
                         if found == n_neighbours:
                             if s >= square[found - 1]:
                                 continue
-                            place = found - 1
+                            at = found - 1
                         else:
-                            place = found
+                            at = found
                             found += 1
-                        while place > 0 and square[place - 1] > s:
-                            square[place], near[place] = square[place - 1], near[place - 1]
-                            place -= 1
-                        square[place], near[place] = s, m
-        _thinnest(points, near, found, out[number[n]])
+                        while at > 0 and square[at - 1] > s:
+                            square[at], near[at] = square[at - 1], near[at - 1]
+                            at -= 1
+                        square[at], near[at] = s, m
+        _thinnest(points, near, found, out[one])
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]

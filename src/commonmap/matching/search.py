@@ -19,10 +19,12 @@ from commonmap.config import ComputeConfig
 from commonmap.frames import from_xyz_yaw
 from commonmap.matching.climb import HERE, climb_all, starts_around
 from commonmap.matching.evidence import count_tables, sum_table, weigh, xlogx_table
+from commonmap.matching.lanes import WIDTH
 from commonmap.matching.slabs import Columns, SlabGrid, coarsen, is_shared, list_columns
 from commonmap.matching.tiles import (
     Level,
     Sweep,
+    circle,
     find_level,
     find_turned_rim,
     plan_tiles,
@@ -94,7 +96,7 @@ def plan_search(
     cell = 2.0 * target.cell
     cells = [cell]
     while True:
-        n_yaw = count_yaws(radius, cells[0])
+        n_yaw = WIDTH * -(-count_yaws(radius, cells[0]) // WIDTH)  # as many as go side by side
         side = [n * target.cell / cells[0] + 2.0 * radius / cells[0] for n in target.shape]
         cost = side[0] * side[1] * n_yaw * (4 * target.n_slabs)
         if cost <= budget or 2.0 * radius / (2.0 * cells[0]) < 16:
@@ -137,7 +139,7 @@ def search(
     cell = plan.cells[0]
     columns = centre_columns(_columns_at(source, target, cell), centre, mirrored=mirrored)
     level = find_level(target, round(cell / target.cell), compute)
-    yaws = 2.0 * np.pi * np.arange(plan.n_yaw) / plan.n_yaw
+    yaws = circle(plan.n_yaw)
     pose, score, per_yaw = _search_all(
         level, columns, yaws, min_overlap, workers, compute, progress
     )

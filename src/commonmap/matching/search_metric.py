@@ -6,7 +6,6 @@ half a cell apart, so that no holes appear; the highest that falls into a cell i
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import numba
@@ -17,6 +16,7 @@ from commonmap.matching.arrays import find_rim
 from commonmap.matching.peaks import local_maxima
 from commonmap.matching.search import Peaks, count_yaws, separate
 from commonmap.matching.slabs import turned_cell
+from commonmap.matching.threads import in_order
 from commonmap.matching.tiles import N_PEAKS
 from commonmap.metrics.plans import DifferenceSum, JointHistogram, MinSum, Smooth
 from commonmap.metrics.table import find_metric
@@ -96,10 +96,9 @@ def search_metric(
         origin=low_t,
     )  # fmt: skip
     found = []
-    with ThreadPoolExecutor(max_workers=workers) as pool:
-        for n, peaks in enumerate(pool.map(one, yaws)):
-            found.append(peaks)
-            progress("search", (n + 1) / n_yaw)
+    for n, peaks in enumerate(in_order(one, yaws, workers)):
+        found.append(peaks)
+        progress("search", (n + 1) / n_yaw)
     rows = np.concatenate(found)
     best = np.array([f[:, 3].max(initial=-np.inf) for f in found])
     order = separate(rows[:, :3], rows[:, 3], 4.0 * cell, 6.0 * np.pi / n_yaw, n_peaks)

@@ -11,7 +11,6 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice, pairwise
@@ -42,6 +41,7 @@ from commonmap.matching.slabs import (
     scatter_turns,
     turned_cell,
 )
+from commonmap.matching.threads import in_order
 from commonmap.types import Float64s, Progress
 
 N_PEAKS = 6
@@ -266,13 +266,17 @@ def search_tile(
     )  # fmt: skip
     some = partial(_search_yaws, task=task, spectra=spectra)
     starts = range(0, len(sweep.yaws), spectra.at_once)
-    with ThreadPoolExecutor(max_workers=workers) as pool:
-        for start, peaks in zip(starts, pool.map(some, starts), strict=True):
-            for n, one in enumerate(peaks, start):
-                number = np.full((len(one), 1), n)
-                found.append(np.column_stack([number, one]) + np.array([*task.first, 0]))
-            tell(min(start + spectra.at_once, len(sweep.yaws)) / len(sweep.yaws))
+    for start, peaks in zip(starts, in_order(some, starts, workers), strict=True):
+        number = np.repeat(np.arange(start, start + len(peaks)), [len(one) for one in peaks])
+        rows = np.column_stack([number, np.concatenate(peaks)])
+        found.append(rows + np.array([*task.first, 0]))
+        tell(min(start + spectra.at_once, len(sweep.yaws)) / len(sweep.yaws))
     return np.concatenate(found)
+
+
+def circle(n: int) -> Float64s:
+    """Return n yaws that share out the full circle, radians."""
+    return np.asarray(2.0 * np.pi * np.arange(n) / n)
 
 
 def turn_columns(sweep: Sweep, yaws: Float64s) -> tuple[Bits, Bits]:
@@ -288,13 +292,19 @@ def turn_columns(sweep: Sweep, yaws: Float64s) -> tuple[Bits, Bits]:
 def find_turned_rim(sweep: Sweep) -> tuple[int, int]:
     """Return how many rows and columns at each end hold too few known cells for a pose, at any yaw.
 
-    What `arrays.find_rim` says of the sources that `turn_columns` returns.
+    What `arrays.find_rim` says of the sources that `turn_columns` returns. Where the yaws share out
+    the circle in fours, a quarter of them tells of all: the others' rows are its columns, and its
+    rows from the other end. Only at right angles a cell's border may belong to either side.
     """
+    n, yaws = len(sweep.yaws), sweep.yaws
+    if n % 4 == 0 and np.array_equal(yaws, circle(n)):
+        yaws = yaws[[*range(n // 4 + 1), n // 2, 3 * n // 4]]
     rows, columns = _find_turned_rim(
-        sweep.columns.xy, np.cos(sweep.yaws), np.sin(sweep.yaws), sweep.cell, sweep.low, sweep.side,
+        sweep.columns.xy, np.cos(yaws), np.sin(yaws), sweep.cell, sweep.low, sweep.side,
         max(1, math.ceil(sweep.min_pairs)),
     )  # fmt: skip
-    return rows, columns
+    least = min(rows, columns)
+    return (least, least) if len(yaws) < n else (rows, columns)
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 
@@ -41,10 +39,8 @@ from commonmap.matching.refine import (
     walking_voxel,
 )
 from commonmap.matching.search import Peaks
+from commonmap.matching.threads import both, in_order
 from commonmap.types import Float64s
-
-First = TypeVar("First")
-Second = TypeVar("Second")
 
 CLOSE = 0.64
 """Peaks with at least this share of the best evidence are looked at on the points too."""
@@ -151,17 +147,16 @@ def verify(
     change places by what the points say. sure: the pose will be taken whatever speaks against it;
     else one that is lost already does not settle on the finest points.
     """
-    source, maps = both(maps.source, maps.with_target)
+    source, maps = both(maps.source, maps.with_target, workers)
     looks: dict[int, Look] = {}
     if on_evidence:
         found, looks = _choose(maps, source, found, workers)
-    figures = measure_figures(
-        maps.base_layers, maps.draft_layers, found, witness, decoy, maps.cell
-    )
+    figures = measure_figures(maps.base_layers, maps.draft_layers, found, witness, decoy, maps.cell)
     settled = sure or not is_lost(figures)
     look, chance = both(
         lambda: _look(maps, source, found, looks.get(0), settled=settled),
         lambda: look_mirrored(maps.base, maps.target_near, source, decoy, maps.cell),
+        workers,
     )
     figures = with_looks(figures, look, chance, maps.cell)
     if is_open(figures):
@@ -190,6 +185,7 @@ def _look_closer(
             maps.base_layers.slabs, maps.draft_layers.slabs, found, maps.cell, workers=workers
         ),
         second,
+        workers,
     )
     if halves is not None:
         figures = replace(figures, half_1=halves[0], half_2=halves[1])
@@ -208,8 +204,7 @@ def _choose(
     if not close:
         return found, {}
     ranks = [0, *close[: MOST_RIVALS - 1]]
-    with ThreadPoolExecutor(max_workers=workers) as pool:
-        looks = list(pool.map(lambda rank: _glimpse(maps, source, found, rank), ranks))
+    looks = list(in_order(lambda rank: _glimpse(maps, source, found, rank), ranks, workers))
     values = [
         rank_value(float(found.score[rank]), look.inliers, look.ground)
         for rank, look in zip(ranks, looks, strict=True)
@@ -235,9 +230,7 @@ def _walk(maps: Maps, source: Source, found: Peaks, rank: int) -> tuple[Walk, Ta
     return walk(target.surface, source.walkers, T, cell=maps.searched), target
 
 
-def _look(
-    maps: Maps, source: Source, found: Peaks, glimpse: Look | None, *, settled: bool
-) -> Look:
+def _look(maps: Maps, source: Source, found: Peaks, glimpse: Look | None, *, settled: bool) -> Look:
     """Return the best pose refined, and how the points lie there.
 
     glimpse: what was had of it. settled: on the finest points, if the walk did not leave the peak.
@@ -317,10 +310,3 @@ def ground_misfit(base: Prepared, points: Points, T_target_source: Float64s) -> 
         return None
     step = placed[seen, 2] - ground.height_at(placed[seen, :2])
     return float(1.4826 * np.median(np.abs(step - np.median(step))))
-
-
-def both(first: Callable[[], First], second: Callable[[], Second]) -> tuple[First, Second]:
-    """Return what both functions return, side by side."""
-    with ThreadPoolExecutor(max_workers=2) as pool:
-        one, other = pool.submit(first), pool.submit(second)
-        return one.result(), other.result()
