@@ -25,6 +25,7 @@ from functools import lru_cache, partial
 from itertools import zip_longest
 from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
@@ -237,10 +238,15 @@ def evidence_peaks(
     return [_list_peaks(*found) for found in zip(index, value, strict=True)]
 
 
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
 def _list_peaks(index: NDArray[np.int64], value: Float32s) -> Float64s:
     """Return u, v, score (n, 3) of the peaks that were found."""
-    found = index[:, 0] >= 0
-    return np.column_stack([index[found], value[found].astype(np.float64)])
+    out, n = np.empty((index.shape[0], 3)), 0
+    for k in range(index.shape[0]):
+        if index[k, 0] >= 0:
+            out[n, 0], out[n, 1], out[n, 2] = index[k, 0], index[k, 1], value[k]
+            n += 1
+    return out[:n]
 
 
 def _correlate(target: Spectra, occupied: Bits, known: Bits) -> tuple[Any, Lanes]:

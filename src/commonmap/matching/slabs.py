@@ -131,8 +131,16 @@ def _join(bits, factor, first_i, first_j, out):  # type: ignore[no-untyped-def]
 
 def is_shared(known: Bits, n_slabs: int) -> bool:
     """Return whether every cell is known in all slabs or in none."""
-    full = np.uint32((1 << n_slabs) - 1)
-    return bool(np.all((known == 0) | (known == full)))
+    full = known.dtype.type((1 << n_slabs) - 1)
+    return bool(_is_all_or_nothing(np.ascontiguousarray(known).reshape(-1), full))
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _is_all_or_nothing(bits, full):  # type: ignore[no-untyped-def]
+    for one in bits:
+        if one != 0 and one != full:
+            return False
+    return True
 
 
 def find_standing(occupied: Bits, n_slabs: int) -> tuple[bool, ...]:

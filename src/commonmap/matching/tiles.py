@@ -340,8 +340,9 @@ def _search_yaws(start: int, *, task: Task, spectra: Spectra) -> list[Float64s]:
         own.rows[0] - seen.rows[0], seen.rows[1] - own.rows[1],
         own.columns[0] - seen.columns[0], seen.columns[1] - own.columns[1],
     )  # fmt: skip
+    first = np.array([seen.rows[0], seen.columns[0], 0])
     found = evidence_peaks(spectra, occupied, known, rim, N_PEAKS, min_overlap=sweep.min_pairs)
-    return [peaks + np.array([seen.rows[0], seen.columns[0], 0]) for peaks in found]
+    return [peaks + first for peaks in found]
 
 
 def _best_of_each_yaw(peaks: Float64s, n_yaws: int) -> list[Float64s]:
