@@ -35,10 +35,6 @@ MOST_COARSE = 15_000
 MOST_OF_PART = 2_000
 """Points above ground that are looked at of each part of the map."""
 
-NEAR = 10.0
-"""Metres, how far from the origin the middle of a cloud may lie: turned about it, tilts stay apart
-from shifts."""
-
 PRIOR_TILT = math.radians(1.5)
 """How far from level a map is expected to be that says it is (standard deviation)."""
 
@@ -71,9 +67,7 @@ def find_level(xyz: Float64s) -> Levelling:
     if len(xyz) < 200:
         return no_levelling("too few points to tell which way is up")
     centred = sample(xyz, MOST_POINTS)
-    middle = np.median(sample(centred, 20_000), axis=0)
-    if np.abs(middle).max() > NEAR:
-        centred = move(from_rotation(np.eye(3), -middle), centred)
+    centred = move(from_rotation(np.eye(3), -np.median(sample(centred, 20_000), axis=0)), centred)
 
     # Roughly up: the map's own z, unless another direction has ground under everything
     up, own = _rough_up(centred)

@@ -68,7 +68,6 @@ def prepare(item: Cloud | Leaves | Float64s, name: str, config: Config) -> Prepa
     """Return a map with its points level and near the origin, and its ground."""
     xyz = points_of(item, name)
     middle = np.round(np.median(sample(xyz, 100_000), axis=0))
-    T_middle = from_rotation(np.eye(3), -middle)
     low, high = bounds(xyz)
     extent = (high - low)[:2]
     if len(xyz) < 100 or float(extent.max()) < 1.0:
@@ -85,8 +84,8 @@ def prepare(item: Cloud | Leaves | Float64s, name: str, config: Config) -> Prepa
     elif isinstance(item, Cloud) and item.crs is not None:
         levelling = no_levelling("a map with a coordinate reference system is level")
     else:
-        levelling = find_level(move(T_middle, sample(xyz, LEVEL_POINTS)))
-    T_prepared_map = levelling.T_level_map @ T_middle
+        levelling = find_level(sample(xyz, LEVEL_POINTS))
+    T_prepared_map = levelling.T_level_map @ from_rotation(np.eye(3), -middle)
     local = move(T_prepared_map, xyz)
     ground = find_ground(local)
     height = ground.height_above(local)
