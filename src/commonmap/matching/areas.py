@@ -44,7 +44,7 @@ from commonmap.matching.maps import (
     prepare,
 )
 from commonmap.matching.refine import lift, settle, walk
-from commonmap.matching.search import Peaks, search
+from commonmap.matching.search import Peaks, search_both
 from commonmap.matching.slabs import SlabGrid
 from commonmap.matching.verify import (
     Target,
@@ -199,10 +199,9 @@ def _match_alone(
         return None
     if len(thin(own.xyz, cell)) < LEAST_VOXELS:
         return None
-    found = search(layers[0].slabs, slabs, min_overlap=LEAST_OVERLAP)
+    found, decoy = search_both(layers[0].slabs, slabs, min_overlap=LEAST_OVERLAP)
     if len(found.score) == 0:
         return None
-    decoy = search(layers[0].slabs, slabs, min_overlap=LEAST_OVERLAP, mirrored=True)
     T = lift(found.T_target_source(), base.ground, draft.ground)
     source = find_source(own, cell)
     way = walk(there.surface, source.walkers, T, cell=cell)

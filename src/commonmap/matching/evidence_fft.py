@@ -156,9 +156,10 @@ def rounding(shape: tuple[int, int], n_target: int, n_source: int) -> float:
 
 
 def bytes_held(
-    shape: tuple[int, int], side: int, n_slabs: int, *, shared: bool, workers: int
-) -> float:
-    """Return what the transforms of a target hold at most, its own once, of each worker the rest.
+    shape: tuple[int, int], side: int, n_slabs: int, *, shared: bool, workers: int,
+    n_targets: int = 1,
+) -> float:  # fmt: skip
+    """Return what the transforms of targets hold at most, their own once, of each worker the rest.
 
     shape: of the transforms. side: of a square source. A value of all lanes takes 64 bytes.
     """
@@ -168,7 +169,7 @@ def bytes_held(
     own = n * (len(job.parts) + len(job.products)) + max(shape) * (side + len(job.products) + 2)
     scores = WIDTH * (3 * 4 * shape[1] + 2 * 4 * side * side)
     target = 8.0 * n * (n_slabs + (1 if shared else n_slabs) + 2)
-    held = target + workers * (64.0 * own + scores)
+    held = n_targets * target + workers * (64.0 * own + scores)
     return held * (1.0 if rounding(shape, n, side * side) < 0.5 else 2.0)
 
 
@@ -201,7 +202,8 @@ def evidence_surfaces(
         shared = target.shared_known and is_shared(known, target.n_slabs)
         standing = find_standing(occupied, target.n_slabs)
         return evidence_device.score(target, occupied, known, shared, standing, least, table)
-    products, job = _correlate(target, occupied, known)
+    job = _plan_job(target, occupied, known)
+    products = _multiply(target, job, _transform(target, job, occupied, known))
     score = borrow(NUMPY, "evidence score", (occupied.shape[2], *target.shape), np.float32)
     overlap = borrow(NUMPY, "evidence overlap", score.shape, np.float32)
     score_rows(
@@ -223,19 +225,37 @@ def evidence_peaks(
     The rest as in `evidence_surfaces`, from which they could be read off; most scores are never
     worked out here, since a bound of them is too low.
     """
-    if target.arrays.name != "numpy":
-        score, _ = evidence_surfaces(target, occupied, known, min_overlap=min_overlap)
-        return [_list_peaks(*local_maxima(one, n_peaks, 0.0, *rim)) for one in score]
-    low_u, high_u, low_v, high_v = rim
-    n_u, n_v = target.shape
-    own = (low_u, n_u - high_u, low_v, n_v - high_v)
+    return peaks_on_each(
+        (target,), occupied, known, rim, n_peaks, min_overlap=min_overlap
+    )[0]  # fmt: skip
+
+
+def peaks_on_each(
+    targets: Sequence[Spectra], occupied: Bits, known: Bits, rim: Sequence[int], n_peaks: int, *,
+    min_overlap: float,
+) -> list[list[Float64s]]:  # fmt: skip
+    """Return the same on each of several targets of one size; the source is transformed once."""
     least, table = math.ceil(min_overlap), xlogx_table(occupied.shape[0] * occupied.shape[1])
-    products, job = _correlate(target, occupied, known)
-    index, value = find_peaks(
-        products, job.counts, job.overlaps, occupied.shape[2], (target.columns[0], n_v), own, least,
-        n_peaks, table, target.plans[1],
-    )  # fmt: skip
-    return [_list_peaks(*found) for found in zip(index, value, strict=True)]
+    low_u, high_u, low_v, high_v = rim
+    turned: Turned | None = None
+    answers = []
+    for target in targets:
+        if target.arrays.name != "numpy":
+            score, _ = evidence_surfaces(target, occupied, known, min_overlap=min_overlap)
+            found = [local_maxima(one, n_peaks, 0.0, *rim) for one in score]
+            answers.append([_list_peaks(*one) for one in found])
+            continue
+        n_u, n_v = target.shape
+        own = (low_u, n_u - high_u, low_v, n_v - high_v)
+        job = _plan_job(target, occupied, known)
+        if turned is None or not turned.serves(target, job):
+            turned = _transform(target, job, occupied, known)
+        index, value = find_peaks(
+            _multiply(target, job, turned), job.counts, job.overlaps, occupied.shape[2],
+            (target.columns[0], n_v), own, least, n_peaks, table, target.plans[1],
+        )  # fmt: skip
+        answers.append([_list_peaks(*one) for one in zip(index, value, strict=True)])
+    return answers
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
@@ -249,28 +269,46 @@ def _list_peaks(index: NDArray[np.int64], value: Float32s) -> Float64s:
     return out[:n]
 
 
-def _correlate(target: Spectra, occupied: Bits, known: Bits) -> tuple[Any, Lanes]:
-    """Return the products (U, n, Ny * STEP), still to go back along y, and what they hold."""
-    n_yaws = occupied.shape[2]
-    if n_yaws > WIDTH:
-        raise ValueError(f"at most {WIDTH} yaws at a time; {n_yaws} came")
+def _plan_job(target: Spectra, occupied: Bits, known: Bits) -> Lanes:
+    """Return which lanes of turned sources and which products the target's counts need."""
+    if occupied.shape[2] > WIDTH:
+        raise ValueError(f"at most {WIDTH} yaws at a time; {occupied.shape[2]} came")
     shared = target.shared_known and is_shared(known, target.n_slabs)
     standing = find_standing(occupied, target.n_slabs)
-    job = plan_lanes(standing, target.standing, shared, target.shared_known)
+    return plan_lanes(standing, target.standing, shared, target.shared_known)
+
+
+@dataclass(frozen=True, eq=False)
+class Turned:
+    """The spectra of turned sources, (n_lanes, Ny, Nx * STEP), and what each lane holds."""
+
+    lanes: Array
+    parts: NDArray[np.int64]
+
+    def serves(self, target: Spectra, job: Lanes) -> bool:
+        """Return whether the target's products can be made of these."""
+        n_x, n_y = target.fft_shape
+        alike = self.lanes.dtype == target.dtype and self.lanes.shape[1:] == (n_y, n_x * STEP)
+        return bool(alike and np.array_equal(self.parts, job.parts))
+
+
+def _transform(target: Spectra, job: Lanes, occupied: Bits, known: Bits) -> Turned:
+    """Return the spectra of turned sources, as the target needs them."""
     n_x, n_y = target.fft_shape
-    rows, lanes, products = (
-        borrow(NUMPY, "evidence " + role, shape, target.dtype)
-        for role, shape in (
-            ("rows", (n_y, occupied.shape[0] * STEP)),
-            ("lanes", (len(job.parts), n_y, n_x * STEP)),
-            ("products", (target.shape[0], len(job.products), n_y * STEP)),
-        )
-    )
+    rows = borrow(NUMPY, "evidence rows", (n_y, occupied.shape[0] * STEP), target.dtype)
+    lanes = borrow(NUMPY, "evidence lanes", (len(job.parts), n_y, n_x * STEP), target.dtype)
     transform_sources(occupied, known, job.parts, *target.plans, rows, lanes)
+    return Turned(lanes, job.parts)
+
+
+def _multiply(target: Spectra, job: Lanes, turned: Turned) -> Array:
+    """Return the products (U, n, Ny * STEP), still to go back along y."""
+    shape = (target.shape[0], len(job.products), target.fft_shape[1] * STEP)
+    products = borrow(NUMPY, "evidence products", shape, target.dtype)
     multiply_and_invert(
-        lanes, target.layers, job.products, target.rows[0], target.plans[0], products
+        turned.lanes, target.layers, job.products, target.rows[0], target.plans[0], products
     )
-    return products, job
+    return products
 
 
 @dataclass(frozen=True, eq=False)

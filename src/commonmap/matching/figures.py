@@ -39,7 +39,7 @@ def measure_figures(
     is left open.
     """
     grid = coarsen(base_layers.slabs, 2)
-    columns = centre_columns(list_columns(draft_layers.slabs), found.centre, mirrored=False)
+    columns = centre_columns(list_columns(draft_layers.slabs), found.centre)
     best = evidence_at(grid, columns, found.pose[0])
     elsewhere = other_poses(witness, found.pose[0], cell)
     second_score = float(witness.score[elsewhere].max(initial=0.0))

@@ -38,7 +38,7 @@ def measure_halves(
     """
     grid = coarsen(target, 2)
     columns = list_columns(source)
-    over = _over_known(grid, centre_columns(columns, found.centre, mirrored=False), found.pose[0])
+    over = _over_known(grid, centre_columns(columns, found.centre), found.pose[0])
     standing = over & (columns.occupied > 0)
     if np.count_nonzero(standing) < LEAST_COLUMNS:
         return None
@@ -93,9 +93,7 @@ def _ratio(
     peaks = search(target, half, min_overlap=HALF_OVERLAP, plan=plan, workers=workers)
     middle = found.T_target_source() @ np.array([*peaks.centre, 0.0, 1.0])
     pose = np.array([*middle[:2], found.pose[0, 2]])
-    here = evidence_at(
-        grid, centre_columns(list_columns(half), peaks.centre, mirrored=False), pose
-    ).score
+    here = evidence_at(grid, centre_columns(list_columns(half), peaks.centre), pose).score
     away = other_poses(peaks, pose, cell)
     near = float(peaks.score[~away].max(initial=here))
     return near / max(float(peaks.score[away].max(initial=0.0)), 1e-9)

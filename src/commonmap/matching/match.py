@@ -29,7 +29,7 @@ from commonmap.matching.search import (
     centre_columns,
     plan_glance,
     plan_search,
-    search,
+    search_both,
 )
 from commonmap.matching.search_metric import search_metric
 from commonmap.matching.seen_free import know_by_rays
@@ -99,14 +99,13 @@ def match(
             )
 
     # 3. every x, y and yaw; and again with the source mirrored
-    found, decoy = _search_both(base_layers, draft_layers, config, timings, progress)
-    witness, witness_decoy = found, decoy
-    if METRICS[config.search.metric].layers != "slabs":
-        # Whatever metric searched, the verdict is on evidence against what chance finds of it
-        by_evidence = config.with_values(search={"metric": "evidence"})
-        witness, witness_decoy = _search_both(
-            base_layers, draft_layers, by_evidence, timings, progress
-        )
+    with _timed(timings, "search"):
+        found, decoy = _search_both(base_layers, draft_layers, config, progress)
+        witness, witness_decoy = found, decoy
+        if METRICS[config.search.metric].layers != "slabs":
+            # Whatever metric searched, the verdict is on evidence against what chance finds of it
+            by_evidence = config.with_values(search={"metric": "evidence"})
+            witness, witness_decoy = _search_both(base_layers, draft_layers, by_evidence, progress)
 
     # 4. z in closed form, then all six degrees of freedom on the points, of the best pose, of those
     #    close to it, and of the mirrored source's, which cannot be right
@@ -139,7 +138,7 @@ def least_overlap(config: Config) -> float:
 
 
 def _search_both(
-    base: Layers, draft: Layers, config: Config, timings: dict[str, float], progress: Progress
+    base: Layers, draft: Layers, config: Config, progress: Progress
 ) -> tuple[Peaks, Peaks]:
     """Return the best poses of the source as it is, and of the mirrored source.
 
@@ -154,41 +153,37 @@ def _search_both(
             "there is nothing to match"
         )
 
-    def by(plan: SearchPlan | None) -> tuple[Peaks, Peaks]:
-        found, decoy = (
-            _search(base, draft, config, plan, mirrored, timings, progress)
-            for mirrored in (False, True)
+    if METRICS[config.search.metric].layers == "slabs":
+        glance = _search(base, draft, plan_glance(base.slabs, draft.slabs), config, progress)
+        if is_told_at_a_glance(*glance):
+            return glance
+        return _search(base, draft, plan_search(base.slabs, draft.slabs), config, progress)
+    found, decoy = (
+        search_metric(
+            base.grid, draft.grid, metric=config.search.metric, normalise=config.search.normalise,
+            floor=config.search.floor, min_overlap=least_overlap(config), mirrored=mirrored,
+            arrays=config.compute.arrays, workers=WORKERS, progress=_renamed(progress, mirrored),
         )
-        return found, decoy
-
-    if METRICS[config.search.metric].layers != "slabs":
-        return by(None)
-    glance = by(plan_glance(base.slabs, draft.slabs))
-    if is_told_at_a_glance(*glance):
-        return glance
-    return by(plan_search(base.slabs, draft.slabs))
+        for mirrored in (False, True)
+    )  # fmt: skip
+    return found, decoy
 
 
 def _search(
-    base: Layers, draft: Layers, config: Config, plan: SearchPlan | None, mirrored: bool,
-    timings: dict[str, float], progress: Progress,
-) -> Peaks:  # fmt: skip
-    """Return the best poses by the metric; plan: of a search on slabs."""
+    base: Layers, draft: Layers, plan: SearchPlan, config: Config, progress: Progress
+) -> tuple[Peaks, Peaks]:
+    """Return the best poses by the evidence, of the source as it is and mirrored."""
+    return search_both(
+        base.slabs, draft.slabs, min_overlap=least_overlap(config), plan=plan, workers=WORKERS,
+        compute=config.compute, progress=progress,
+    )  # fmt: skip
 
-    def tell(step: str, share: float = 0.0) -> None:
-        progress("search the mirrored map" if mirrored else step, share)
 
-    with _timed(timings, "decoy" if mirrored else "search"):
-        if plan is not None:
-            return search(
-                base.slabs, draft.slabs, min_overlap=least_overlap(config), mirrored=mirrored,
-                plan=plan, workers=WORKERS, compute=config.compute, progress=tell,
-            )  # fmt: skip
-        return search_metric(
-            base.grid, draft.grid, metric=config.search.metric, normalise=config.search.normalise,
-            floor=config.search.floor, min_overlap=least_overlap(config), mirrored=mirrored,
-            arrays=config.compute.arrays, workers=WORKERS, progress=tell,
-        )  # fmt: skip
+def _renamed(progress: Progress, mirrored: bool) -> Progress:
+    """Return the progress of a search, which says so where the source is mirrored."""
+    if not mirrored:
+        return progress
+    return lambda step, share=0.0: progress("search the mirrored map", share)
 
 
 def _answer(
@@ -258,8 +253,7 @@ def _draw(
     cell = plan_search(base, draft).cells[0]
     grid = coarsen(base, round(cell / base.cell))
     columns = centre_columns(
-        list_columns(coarsen(draft, max(1, round(0.5 * cell / draft.cell)))), found.centre,
-        mirrored=False,
+        list_columns(coarsen(draft, max(1, round(0.5 * cell / draft.cell)))), found.centre
     )  # fmt: skip
     side = 2 * int(np.ceil(float(np.hypot(*columns.xy.T).max()) / cell)) + 2
     low = np.full(2, -0.5 * side * cell)

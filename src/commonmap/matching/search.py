@@ -130,32 +130,94 @@ def search(
     The answer is the same for any number of workers, and wherever and in whatever memory the
     search runs. A large target may be mapped from a file: it is read in parts.
     """
+    return _search_sides(
+        target, source, (mirrored,), min_overlap, plan, n_peaks, workers, compute, progress
+    )[0]
+
+
+def search_both(
+    target: SlabGrid,
+    source: SlabGrid,
+    *,
+    min_overlap: float,
+    plan: SearchPlan | None = None,
+    n_peaks: int = 16,
+    workers: int = 2,
+    compute: ComputeConfig | None = None,
+    progress: Progress = no_progress,
+) -> tuple[Peaks, Peaks]:
+    """Return what `search` does of the source as it is, and of the mirrored one.
+
+    In less time than one after the other: both are turned and transformed once.
+    """
+    found, decoy = _search_sides(
+        target, source, (False, True), min_overlap, plan, n_peaks, workers, compute, progress
+    )
+    return found, decoy
+
+
+def _search_sides(
+    target: SlabGrid, source: SlabGrid, sides: tuple[bool, ...], min_overlap: float,
+    plan: SearchPlan | None, n_peaks: int, workers: int, compute: ComputeConfig | None,
+    progress: Progress,
+) -> list[Peaks]:  # fmt: skip
+    """Return the peaks of each side, False of the source as it is, True of the mirrored one.
+
+    That one on the target is the source on the mirrored target, and is searched so.
+    """
     plan = plan or plan_search(target, source)
     compute = compute or ComputeConfig()
-    finest = 2.0 * target.cell
     centre = _centre(list_columns(source))
+    rungs = [_find_rung(target, source, cell, centre, min_overlap, compute) for cell in plan.cells]
 
-    # Every pose at the coarsest cell
-    cell = plan.cells[0]
-    columns = centre_columns(_columns_at(source, target, cell), centre, mirrored=mirrored)
-    level = find_level(target, round(cell / target.cell), compute)
-    yaws = circle(plan.n_yaw)
-    pose, score, per_yaw = _search_all(
-        level, columns, yaws, min_overlap, workers, compute, progress
-    )
-    order = separate(pose, score, 2.0 * cell, 3.0 * np.pi / plan.n_yaw, plan.keep[0])
+    # Every pose at the coarsest cell; then each candidate climbs down the ladder
+    found = _search_all(rungs[0], sides, circle(plan.n_yaw), workers, compute, progress)
+    return [
+        _descend(rungs, plan, *one, centre, mirrored=mirrored, n_peaks=n_peaks, workers=workers)
+        for one, mirrored in zip(found, sides, strict=True)
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class Rung:
+    """Both maps on cells of one width. columns: of the source, about its centre.
+
+    n_known: cells that the source knows, unturned. least_pairs: known pairs that a pose needs.
+    """
+
+    level: Level
+    columns: Columns
+    n_known: int
+    least_pairs: float
+
+
+def _find_rung(
+    target: SlabGrid, source: SlabGrid, cell: float, centre: Float64s, min_overlap: float,
+    compute: ComputeConfig,
+) -> Rung:  # fmt: skip
+    factor = round(cell / target.cell)
+    # the source's columns on half of the cell: no holes when turned
+    columns = centre_columns(list_columns(coarsen(source, max(1, factor // 2))), centre)
+    n_known = _known_cells(columns, cell)
+    return Rung(find_level(target, factor, compute), columns, n_known, min_overlap * n_known)
+
+
+def _descend(
+    rungs: list[Rung], plan: SearchPlan, pose: Float64s, score: Float64s, per_yaw: Float64s,
+    centre: Float64s, *, mirrored: bool, n_peaks: int, workers: int,
+) -> Peaks:  # fmt: skip
+    """Return the best of the coarsest cell's peaks (M, 3), on the finest cell."""
+    finest = plan.cells[-1]
+    step = 2.0 * np.pi / plan.n_yaw
+    order = separate(pose, score, 2.0 * plan.cells[0], 1.5 * step, plan.keep[0])
     pose = pose[order]
 
     # Each candidate climbs at this cell, then at half of it, and so on
-    step = 2.0 * np.pi / plan.n_yaw
-    for n, cell in enumerate(plan.cells):
-        if n > 0:
-            columns = centre_columns(_columns_at(source, target, cell), centre, mirrored=mirrored)
-            level = find_level(target, round(cell / target.cell), compute)
+    for n, (rung, cell) in enumerate(zip(rungs, plan.cells, strict=True)):
         yaw_step = step * cell / plan.cells[0] / 2.0
-        n_known = _known_cells(columns, cell)
+        level = rung.level.mirror() if mirrored else rung.level
         climb = partial(
-            climb_all, level, columns, yaw_step=yaw_step, least_pairs=min_overlap * n_known,
+            climb_all, level, rung.columns, yaw_step=yaw_step, least_pairs=rung.least_pairs,
             workers=workers,
         )  # fmt: skip
         pose, score, pairs = climb(pose, starts=starts_around(2, 1) if n > 0 else HERE)
@@ -172,8 +234,9 @@ def search(
         np.concatenate([new, old]) for new, old in zip(again, (pose, score, pairs), strict=True)
     )
     order = separate(pose, score, 4.0 * finest, 6.0 * yaw_step, n_peaks)
-    overlap = np.minimum(pairs[order] / max(n_known, 1), 1.0)
-    return Peaks(pose[order], score[order], overlap, centre, per_yaw, finest)
+    pose = pose[order] * np.array([-1.0, 1.0, -1.0] if mirrored else [1.0, 1.0, 1.0])
+    overlap = np.minimum(pairs[order] / max(rungs[-1].n_known, 1), 1.0)
+    return Peaks(pose, score[order], overlap, centre, per_yaw, finest)
 
 
 @dataclass(frozen=True)
@@ -202,12 +265,6 @@ def evidence_at(target: SlabGrid, columns: Columns, pose: Float64s) -> Standing:
     return Standing(float(weigh(evidence, doubt)), float(evidence), int(table[:, 0].max()))
 
 
-def _columns_at(source: SlabGrid, target: SlabGrid, cell: float) -> Columns:
-    """Return the source's columns on half of a level's cell: no holes when turned."""
-    factor = round(cell / target.cell)
-    return list_columns(coarsen(source, max(1, factor // 2)))
-
-
 def _centre(columns: Columns) -> Float64s:
     return np.asarray(0.5 * (columns.xy.min(axis=0) + columns.xy.max(axis=0)))
 
@@ -223,47 +280,51 @@ def count_yaws(radius: float, cell: float) -> int:
     return max(16, int(np.ceil(2.0 * np.pi * radius / cell)))
 
 
-def centre_columns(columns: Columns, centre: Float64s, *, mirrored: bool) -> Columns:
-    """Return the columns about a point of the source, and reflected (x -> -x) if mirrored."""
-    xy = columns.xy - centre
-    if mirrored:
-        xy = xy * np.array([-1.0, 1.0])
-    return Columns(np.ascontiguousarray(xy), columns.occupied, columns.known, columns.n_slabs)
+def centre_columns(columns: Columns, centre: Float64s) -> Columns:
+    """Return the columns about a point of the source."""
+    xy = np.ascontiguousarray(columns.xy - centre)
+    return Columns(xy, columns.occupied, columns.known, columns.n_slabs)
 
 
 def _search_all(
-    level: Level,
-    columns: Columns,
-    yaws: Float64s,
-    min_overlap: float,
-    workers: int,
-    compute: ComputeConfig,
+    rung: Rung, sides: tuple[bool, ...], yaws: Float64s, workers: int, compute: ComputeConfig,
     progress: Progress,
-) -> tuple[Float64s, Float64s, Float64s]:
-    """Return the separate peaks of every yaw: poses (M, 3), scores (M,), and (yaw, best) pairs."""
-    cell = level.cell
+) -> list[tuple[Float64s, Float64s, Float64s]]:  # fmt: skip
+    """Return, of each side, the separate peaks of every yaw: poses (M, 3), scores (M,), per_yaw.
+
+    per_yaw: (n_yaw, 2) yaw and the best score at it. Poses are those of the side's own target.
+    """
+    level, columns, cell = rung.level, rung.columns, rung.level.cell
     reach = float(np.hypot(*columns.xy.T).max())
     side = 2 * int(np.ceil(reach / cell)) + 2
     low = np.full(2, -0.5 * side * cell)
-    min_pairs = min_overlap * _known_cells(columns, cell)
-    sweep = Sweep(columns, cell, low, side, yaws, min_pairs, compute.arrays)
+    sweep = Sweep(columns, cell, low, side, yaws, rung.least_pairs, compute.arrays)
     at_once = workers if compute.scheduler is None else 1
     # where the maps touch in so few rows that no pose there has pairs enough, nothing is scored
     rim = find_turned_rim(sweep)
     shared = level.whole is not None and is_shared(level.whole.known, columns.n_slabs)
     shared = shared and is_shared(columns.known, columns.n_slabs)
     plan = plan_tiles(
-        level.shape, side, columns.n_slabs, shared=shared, compute=compute, workers=at_once, rim=rim
-    )
+        level.shape, side, columns.n_slabs, shared=shared, compute=compute, workers=at_once,
+        rim=rim, n_targets=len(sides),
+    )  # fmt: skip
+    levels = tuple(level.mirror() if mirrored else level for mirrored in sides)
     found = search_tiles(
-        level, sweep, plan.tiles, compute=compute, workers=workers, progress=progress
+        levels, sweep, plan.tiles, compute=compute, workers=workers, progress=progress
     )
+    return [_poses(one, of_side, sweep) for one, of_side in zip(levels, found, strict=True)]
+
+
+def _poses(
+    level: Level, found: list[Float64s], sweep: Sweep
+) -> tuple[Float64s, Float64s, Float64s]:
+    """Return the poses (M, 3) and scores (M,) of translations (n, 3) of every yaw, and per_yaw."""
+    rows, yaws = np.concatenate(found), sweep.yaws
     # translation [u, v] lays the source's point (0, 0) here
-    at = [level.origin + (f[:, :2] - (side - 1)) * cell - low for f in found]
-    yaw = np.repeat(yaws, [len(f) for f in found])
+    at = level.origin + (rows[:, :2] - (sweep.side - 1)) * sweep.cell - sweep.low
+    pose = np.column_stack([at, np.repeat(yaws, [len(f) for f in found])])
     best = np.array([f[:, 2].max(initial=-np.inf) for f in found])
-    pose = np.column_stack([np.concatenate(at), yaw])
-    return pose, np.concatenate(found)[:, 2], np.column_stack([yaws, best])
+    return pose, rows[:, 2], np.column_stack([yaws, best])
 
 
 def _known_cells(columns: Columns, cell: float) -> int:

@@ -55,6 +55,13 @@ def pack_slabs(origin: Float64s, cell: float, occupied: Bools, known: Bools) -> 
     return SlabGrid(np.asarray(origin, float), cell, bits_occupied, bits_known, n_slabs)
 
 
+def mirror_grid(grid: SlabGrid) -> SlabGrid:
+    """Return the grid reflected, x -> -x."""
+    low = -(grid.origin[0] + grid.shape[0] * grid.cell)
+    occupied, known = (np.ascontiguousarray(bits[::-1]) for bits in (grid.occupied, grid.known))
+    return SlabGrid(np.array([low, grid.origin[1]]), grid.cell, occupied, known, grid.n_slabs)
+
+
 def coarsen(grid: SlabGrid, factor: int) -> SlabGrid:
     """Return the grid with cells `factor` times as wide: occupied or known where any part was.
 
@@ -137,10 +144,10 @@ def is_shared(known: Bits, n_slabs: int) -> bool:
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
 def _is_all_or_nothing(bits, full):  # type: ignore[no-untyped-def]
+    between = 0
     for one in bits:
-        if one != 0 and one != full:
-            return False
-    return True
+        between += one != 0 and one != full
+    return between == 0
 
 
 def find_standing(occupied: Bits, n_slabs: int) -> tuple[bool, ...]:

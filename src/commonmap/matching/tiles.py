@@ -25,7 +25,7 @@ from commonmap.matching.arrays import find_arrays
 from commonmap.matching.evidence_fft import (
     Spectra,
     bytes_held,
-    evidence_peaks,
+    peaks_on_each,
     transform_target,
 )
 from commonmap.matching.lane_fft import find_length
@@ -38,6 +38,7 @@ from commonmap.matching.slabs import (
     coarse_shape,
     coarse_window,
     coarsen,
+    mirror_grid,
     scatter_turns,
     turned_cell,
 )
@@ -55,7 +56,8 @@ CONNECT_SECONDS = 10
 class Level:
     """The target on cells `factor` times as wide: whole where it is small, else by windows.
 
-    origin: (2,) metres, lower corner of the level's cell [0, 0]. cell: metres.
+    origin: (2,) metres, lower corner of the level's cell [0, 0]. cell: metres. mirrored: the level
+    is that of the target reflected, x -> -x; `target` is as it was.
     """
 
     target: SlabGrid
@@ -64,9 +66,24 @@ class Level:
     cell: float
     shape: tuple[int, int]
     whole: SlabGrid | None
+    mirrored: bool = False
+
+    def mirror(self) -> Level:
+        """Return the level of the reflected target: cells lie alike to multiples of their width."""
+        low = -(self.origin[0] + self.shape[0] * self.cell)
+        return replace(
+            self,
+            origin=np.array([low, self.origin[1]]),
+            whole=None if self.whole is None else mirror_grid(self.whole),
+            mirrored=not self.mirrored,
+        )
 
     def window(self, rows: Range, columns: Range) -> SlabGrid:
         """Return these cells of the level, which must lie in it."""
+        if self.whole is None and self.mirrored:
+            n_x = self.shape[0]
+            back = n_x - rows[1], n_x - rows[0]
+            return mirror_grid(coarse_window(self.target, self.factor, back, columns))
         if self.whole is None:
             return coarse_window(self.target, self.factor, rows, columns)
         region = slice(*rows), slice(*columns)
@@ -90,9 +107,9 @@ class Level:
 
 
 def find_level(target: SlabGrid, factor: int, compute: ComputeConfig) -> Level:
-    """Return the level; it is kept whole if its bits take less than a quarter of the memory."""
+    """Return the level; it is kept whole if its bits take less than an eighth of the memory."""
     shape = coarse_shape(target, factor)
-    small = 8.0 * shape[0] * shape[1] <= 0.25e9 * compute.memory_gb
+    small = 8.0 * shape[0] * shape[1] <= 0.125e9 * compute.memory_gb
     return Level(
         target, factor, coarse_origin(target, factor), target.cell * factor, shape,
         coarsen(target, factor) if small else None,
@@ -145,11 +162,13 @@ def plan_tiles(
     compute: ComputeConfig,
     workers: int,
     rim: tuple[int, int] = (0, 0),
+    n_targets: int = 1,
 ) -> TilePlan:
     """Return the cheapest tiles that keep the search within `compute.memory_gb`.
 
     shape: of the target. side: of the source's square. shared: both know all slabs alike. rim:
-    translations at each end along x and y that are left out. Raises InputError where no tile does.
+    translations at each end along x and y that are left out. n_targets: searched at a time. Raises
+    InputError where no tile does.
     """
     full = (shape[0] + side - 1, shape[1] + side - 1)
     rim = (min(rim[0], (full[0] - 1) // 2), min(rim[1], (full[1] - 1) // 2))
@@ -159,7 +178,9 @@ def plan_tiles(
     for n_tiles in range(1, max(whole) // 16 + 2):
         extent = -(-max(whole) // n_tiles)
         size = [find_length(min(n, extent + side + 1)) for n in whole]
-        held = bytes_held((size[0], size[1]), side, n_slabs, shared=shared, workers=workers)
+        held = bytes_held(
+            (size[0], size[1]), side, n_slabs, shared=shared, workers=workers, n_targets=n_targets
+        )
         number = np.prod([-(-n // extent) for n in whole])
         work = number * size[0] * size[1] * np.log2(size[0] * size[1])
         least = min(least, held)
@@ -183,11 +204,11 @@ def plan_tiles(
 class Task:
     """One tile at some yaws, with all that its search needs.
 
-    window: the part of the target. tile, seen: the translations to tell, and with them their
+    windows: the part of each target. tile, seen: the translations to tell, and with them their
     neighbours, counted from the window's first cell. first: yaw, u, v of the task's own first ones.
     """
 
-    window: SlabGrid
+    windows: tuple[SlabGrid, ...]
     tile: Tile
     seen: Tile
     sweep: Sweep
@@ -195,28 +216,32 @@ class Task:
 
 
 def search_tiles(
-    level: Level,
+    levels: tuple[Level, ...],
     sweep: Sweep,
     tiles: tuple[Tile, ...],
     *,
     compute: ComputeConfig,
     workers: int,
     progress: Progress,
-) -> list[Float64s]:
-    """Return, of every yaw, the best separate translations (n, 3): u, v, score, best first."""
+) -> list[list[Float64s]]:
+    """Return, of every level and yaw, the best translations (n, 3): u, v, score, best first.
+
+    levels: of one size, that the source is laid on side by side.
+    """
     found = []
     if compute.scheduler is None:
         for n, tile in enumerate(tiles):
-            task = _cut(level, sweep, tile, (0, len(sweep.yaws)))
+            task = _cut(levels, sweep, tile, (0, len(sweep.yaws)))
             tell = partial(_tell, progress, n, len(tiles))
             found.append(search_tile(task, workers=workers, tell=tell))
     else:
         shares = _share_yaws(len(sweep.yaws), len(tiles))
-        tasks = (_cut(level, sweep, tile, yaws) for tile in tiles for yaws in shares)
+        tasks = (_cut(levels, sweep, tile, yaws) for tile in tiles for yaws in shares)
         for n, peaks in enumerate(_on_cluster(compute.scheduler, tasks)):
             found.append(peaks)
             progress("search", (n + 1) / (len(tiles) * len(shares)))
-    return _best_of_each_yaw(np.concatenate(found), len(sweep.yaws))
+    together = (np.concatenate(of_level) for of_level in zip(*found, strict=True))
+    return [_best_of_each_yaw(peaks, len(sweep.yaws)) for peaks in together]
 
 
 def _tell(progress: Progress, n: int, n_tiles: int, share: float) -> None:
@@ -230,15 +255,15 @@ def _share_yaws(n_yaws: int, n_tiles: int) -> list[Range]:
     return list(pairwise(ends))
 
 
-def _cut(level: Level, sweep: Sweep, tile: Tile, yaws: Range) -> Task:
-    """Return the task of a tile: the part of the target that its translations can reach."""
+def _cut(levels: tuple[Level, ...], sweep: Sweep, tile: Tile, yaws: Range) -> Task:
+    """Return the task of a tile: the part of the targets that its translations can reach."""
     seen, reached = [], []
-    for (low, high), n in zip((tile.rows, tile.columns), level.shape, strict=True):
+    for (low, high), n in zip((tile.rows, tile.columns), levels[0].shape, strict=True):
         seen.append((max(low - 1, 0), min(high + 1, n + sweep.side - 1)))
         reached.append((min(max(seen[-1][0] - sweep.side + 1, 0), n - 1), min(seen[-1][1], n)))
     u, v = reached[0][0], reached[1][0]
     return Task(
-        level.window(*reached),
+        tuple(level.window(reached[0], reached[1]) for level in levels),
         Tile(_moved(tile.rows, u), _moved(tile.columns, v)),
         Tile(_moved(seen[0], u), _moved(seen[1], v)),
         replace(sweep, yaws=sweep.yaws[slice(*yaws)]),
@@ -252,26 +277,34 @@ def _moved(range_: Range, by: int) -> Range:
 
 def search_tile(
     task: Task, *, workers: int = 1, tell: Callable[[float], None] = lambda share: None
-) -> Float64s:
-    """Return the best separate translations of a tile, (n, 4): number of the yaw, u, v, score.
+) -> list[Float64s]:
+    """Return the best separate translations of a tile, (n, 4) of each target: yaw, u, v, score.
 
-    At most `N_PEAKS` a yaw. tell: is told the share of yaws that are done.
+    Yaws by number, at most `N_PEAKS` translations of each.
     """
-    sweep, found = task.sweep, [np.zeros((0, 4))]
-    if not task.window.occupied.any():
-        return found[0]
-    spectra = transform_target(
-        task.window, (sweep.side, sweep.side), rows=task.seen.rows, columns=task.seen.columns,
-        n_source=min(sweep.side**2, len(sweep.columns.xy)), arrays=find_arrays(sweep.arrays),
-    )  # fmt: skip
-    some = partial(_search_yaws, task=task, spectra=spectra)
-    starts = range(0, len(sweep.yaws), spectra.at_once)
-    for start, peaks in zip(starts, in_order(some, starts, workers), strict=True):
-        number = np.repeat(np.arange(start, start + len(peaks)), [len(one) for one in peaks])
-        rows = np.column_stack([number, np.concatenate(peaks)])
-        found.append(rows + np.array([*task.first, 0]))
-        tell(min(start + spectra.at_once, len(sweep.yaws)) / len(sweep.yaws))
-    return np.concatenate(found)
+    sweep = task.sweep
+    found = [[np.zeros((0, 4))] for _ in task.windows]
+    standing = [n for n, window in enumerate(task.windows) if window.occupied.any()]
+    if standing:
+        spectra = [
+            transform_target(
+                task.windows[n], (sweep.side, sweep.side), rows=task.seen.rows,
+                columns=task.seen.columns, n_source=min(sweep.side**2, len(sweep.columns.xy)),
+                arrays=find_arrays(sweep.arrays),
+            )
+            for n in standing
+        ]  # fmt: skip
+        some = partial(_search_yaws, task=task, spectra=spectra)
+        at_once = spectra[0].at_once
+        starts = range(0, len(sweep.yaws), at_once)
+        for start, on_each in zip(starts, in_order(some, starts, workers), strict=True):
+            for n, peaks in zip(standing, on_each, strict=True):
+                yaws = np.arange(start, start + len(peaks))
+                number = np.repeat(yaws, [len(one) for one in peaks])
+                rows = np.column_stack([number, np.concatenate(peaks)])
+                found[n].append(rows + np.array([*task.first, 0]))
+            tell(min(start + at_once, len(sweep.yaws)) / len(sweep.yaws))
+    return [np.concatenate(peaks) for peaks in found]
 
 
 def circle(n: int) -> Float64s:
@@ -332,17 +365,17 @@ def _find_turned_rim(xy, cosines, sines, cell, low, side, least):  # type: ignor
     return rim[0], rim[1]
 
 
-def _search_yaws(start: int, *, task: Task, spectra: Spectra) -> list[Float64s]:
-    """Return the best separate translations of a tile, (n, 3): u, v, score, of some yaws."""
+def _search_yaws(start: int, *, task: Task, spectra: list[Spectra]) -> list[list[Float64s]]:
+    """Return the best separate translations on each target, (n, 3): u, v, score, of some yaws."""
     sweep, own, seen = task.sweep, task.tile, task.seen
-    occupied, known = turn_columns(sweep, sweep.yaws[start : start + spectra.at_once])
+    occupied, known = turn_columns(sweep, sweep.yaws[start : start + spectra[0].at_once])
     rim = (
         own.rows[0] - seen.rows[0], seen.rows[1] - own.rows[1],
         own.columns[0] - seen.columns[0], seen.columns[1] - own.columns[1],
     )  # fmt: skip
     first = np.array([seen.rows[0], seen.columns[0], 0])
-    found = evidence_peaks(spectra, occupied, known, rim, N_PEAKS, min_overlap=sweep.min_pairs)
-    return [peaks + first for peaks in found]
+    found = peaks_on_each(spectra, occupied, known, rim, N_PEAKS, min_overlap=sweep.min_pairs)
+    return [[peaks + first for peaks in on_one] for on_one in found]
 
 
 def _best_of_each_yaw(peaks: Float64s, n_yaws: int) -> list[Float64s]:
@@ -356,7 +389,7 @@ def _best_of_each_yaw(peaks: Float64s, n_yaws: int) -> list[Float64s]:
     return [peaks[low : min(low + N_PEAKS, high), 1:] for low, high in pairwise(ends)]
 
 
-def _on_cluster(address: str, tasks: Iterator[Task]) -> Iterator[Float64s]:
+def _on_cluster(address: str, tasks: Iterator[Task]) -> Iterator[list[Float64s]]:
     """Yield the answers of the tasks, as they come, from the workers of a Dask scheduler.
 
     Twice as many tasks as the workers have threads are under way at a time.

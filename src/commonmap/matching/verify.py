@@ -174,22 +174,25 @@ def _look_closer(
     """
     elsewhere = ranks_elsewhere(found, maps.cell)
 
-    def second() -> Look | None:
+    def second_ground() -> float | None:
         if len(elsewhere) == 0:
             return None
         rank = int(elsewhere[0])
-        return looks[rank] if rank in looks else _glimpse(maps, source, found, rank)
+        if rank in looks:
+            return looks[rank].ground
+        refined = _walk(maps, source, found, rank)[0].arrived()
+        return ground_misfit(maps.base, source.points, refined.T_target_source)
 
-    halves, there = both(
+    halves, ground = both(
         lambda: measure_halves(
             maps.base_layers.slabs, maps.draft_layers.slabs, found, maps.cell, workers=workers
         ),
-        second,
+        second_ground,
         workers,
     )
     if halves is not None:
         figures = replace(figures, half_1=halves[0], half_2=halves[1])
-    return replace(figures, second_ground=None if there is None else there.ground)
+    return replace(figures, second_ground=ground)
 
 
 def _choose(
