@@ -129,9 +129,17 @@ def collect(
                 other = {**place, "source": mirror(place["source"]), "mirrored": True}
             record = judge(place, other, seed, draft, 1.0 if (seed + n) % 2 else None, rays=rays)
             add_lines(records, [record])
-            print(seed, draft, record["kind"], record["label"], record["max_height"],
-                  "accepted" if record["accepted"] else "refused",
-                  "right" if record["right"] else "-", f"{record['confidence']:.3f}", flush=True)
+            print(
+                seed,
+                draft,
+                record["kind"],
+                record["label"],
+                record["max_height"],
+                "accepted" if record["accepted"] else "refused",
+                "right" if record["right"] else "-",
+                f"{record['confidence']:.3f}",
+                flush=True,
+            )
 
 
 def mirror(source: Any) -> Any:
@@ -244,15 +252,19 @@ def show(path: Path = RECORDS) -> None:
     print(f"accepted and wrong: {(accepted & ~right).sum()}")
     for kind in KINDS:
         k = j["kind"] == kind
-        print(f"  {kind:11s} same {(k & same).sum():3d}  right {(k & right).sum():3d}  "
-              f"accepted {(k & accepted & right).sum():3d}   other {(k & ~same).sum():3d}  "
-              f"accepted {(k & accepted & ~right).sum()}")
+        print(
+            f"  {kind:11s} same {(k & same).sum():3d}  right {(k & right).sum():3d}  "
+            f"accepted {(k & accepted & right).sum():3d}   other {(k & ~same).sum():3d}  "
+            f"accepted {(k & accepted & ~right).sum()}"
+        )
     print("reliability: probability told (mean), cases, share right")
     for low, high in BINS:
         inside = (p >= low) & (p < high)
         if inside.any():
-            print(f"  {low:.2f} to {min(high, 1):.2f} ({p[inside].mean():.3f})  {inside.sum():4d}  "
-                  f"{right[inside].mean():.3f}")
+            print(
+                f"  {low:.2f} to {min(high, 1):.2f} ({p[inside].mean():.3f})  {inside.sum():4d}  "
+                f"{right[inside].mean():.3f}"
+            )
 
 
 def draw(path: Path) -> None:
@@ -275,10 +287,21 @@ def draw(path: Path) -> None:
                 beta.ppf(0.025, k, n - k + 1) if k else 0.0,
                 beta.ppf(0.975, k + 1, n - k) if k < n else 1.0,
             ])  # fmt: skip
-            left.errorbar(p[inside].mean(), k / n, yerr=np.abs(bounds - k / n)[:, None], fmt="o",
-                          color="#2a78d6", capsize=3)
-            left.annotate(f"{n}", (p[inside].mean(), k / n), xytext=(6, -12),
-                          textcoords="offset points", fontsize=8)
+            left.errorbar(
+                p[inside].mean(),
+                k / n,
+                yerr=np.abs(bounds - k / n)[:, None],
+                fmt="o",
+                color="#2a78d6",
+                capsize=3,
+            )
+            left.annotate(
+                f"{n}",
+                (p[inside].mean(), k / n),
+                xytext=(6, -12),
+                textcoords="offset points",
+                fontsize=8,
+            )
     left.set_xlabel("probability told")
     left.set_ylabel("share that is right (95 %)")
     order = np.argsort(-p, kind="stable")
@@ -287,8 +310,13 @@ def draw(path: Path) -> None:
     other.step(coverage, wrong / np.arange(1, len(p) + 1), where="post", color="#2a78d6")
     at = int((p[order] >= ACCEPT_AT).sum())
     other.plot(coverage[at - 1], wrong[at - 1] / at, "o", color="#d9541e")
-    other.annotate(f"accepted from {ACCEPT_AT:g} on", (coverage[at - 1], wrong[at - 1] / at),
-                   xytext=(-110, 14), textcoords="offset points", fontsize=9)
+    other.annotate(
+        f"accepted from {ACCEPT_AT:g} on",
+        (coverage[at - 1], wrong[at - 1] / at),
+        xytext=(-110, 14),
+        textcoords="offset points",
+        fontsize=9,
+    )
     other.set_xlabel("share of the pairs of one place that are told and right")
     other.set_ylabel("share of the told that are wrong")
     for axis in (left, other):

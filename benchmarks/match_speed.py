@@ -39,7 +39,7 @@ DRAFT, DENSITY, DRAFT_POINTS = 60.0, 83.0, 2_850_000
 T_BASE_DRAFT = from_xyz_yaw(31.0, -12.0, 1.5, 2.2)
 STAGES = {
     "prepare the maps": "prepare", "height maps": "grid", "search": "search",
-    "search the mirrored map": "decoy", "refine": "verify", "decide": "decide",
+    "refine": "verify", "decide": "decide",
 }  # fmt: skip
 Floats = NDArray[np.float64]
 
@@ -203,7 +203,7 @@ def draw() -> None:
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
     left.loglog(area, [r["cpu_s"] for r in rows], "o-", color="black", label="match, CPU")
     left.loglog(area, [r["wall_s"] for r in rows], "s--", color="black", label="match, wall")
-    for name in ("prepare", "search", "decoy", "verify"):
+    for name in ("prepare", "search", "verify"):
         left.loglog(area, [r["stages"][name]["cpu_s"] for r in rows], "o-", label=name)
     n = np.array([r["base_points"] for r in rows], float)
     middle = next((k for k, r in enumerate(rows) if r["side_m"] == 250), len(rows) // 2)

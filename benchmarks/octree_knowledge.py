@@ -68,8 +68,7 @@ def run(seed: int) -> dict[str, Any]:
     cell, edges, max_height = choose_grid(*items, config)
     layers = [build_layers(item, cell, edges, max_height) for item in items]
     free = [
-        see_free(each, cloud, item)
-        for item, cloud, each in zip(items, clouds, layers, strict=True)
+        see_free(each, cloud, item) for item, cloud, each in zip(items, clouds, layers, strict=True)
     ]
     assert free[0] is not None and free[1] is not None
     T_true = items[0].T_prepared_map @ pair.T_target_source @ invert(items[1].T_prepared_map)

@@ -247,8 +247,15 @@ def main() -> None:
             lines.append(judge(pair, make_pair(before, options.cache), "another place"))
         add_lines(RECORDS, ({"seed": seed, **line} for line in lines))
         for line in lines:
-            print(seed, line["kind"], line["label"], line["accepted"],
-                  line.get("metres", "-"), line.get("degrees", "-"), flush=True)
+            print(
+                seed,
+                line["kind"],
+                line["label"],
+                line["accepted"],
+                line.get("metres", "-"),
+                line.get("degrees", "-"),
+                flush=True,
+            )
     show()
 
 

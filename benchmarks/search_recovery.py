@@ -105,8 +105,16 @@ def main() -> None:
         found = list(run(place, options.crops))
         add_lines(path, found)
         for n, record in enumerate(found):
-            print(place, n, record["kind"], f"{record['width']:.0f} m", f"{record['score']:.0f}",
-                  f"{record['exhaustive']:.0f}", "" if record["found"] else "LOWER", flush=True)
+            print(
+                place,
+                n,
+                record["kind"],
+                f"{record['width']:.0f} m",
+                f"{record['score']:.0f}",
+                f"{record['exhaustive']:.0f}",
+                "" if record["found"] else "LOWER",
+                flush=True,
+            )
         records += found
     show(records)
 
@@ -117,12 +125,16 @@ def show(records: list[dict[str, Any]]) -> None:
     elsewhere = [r for r in missed if r["metres_apart"] > 2.0 * r["cell"]]
     ratio = np.median([r["exhaustive_seconds"] / r["seconds"] for r in records])
     higher = sum(r["score"] > r["exhaustive"] * (1.0 + 1e-9) for r in records)
-    print(f"{len(records)} cases: {len(missed)} scored lower than the exhaustive search, "
-          f"{len(elsewhere)} of them elsewhere; {higher} scored higher; {ratio:.1f} times as fast "
-          "(median of CPU time)")
+    print(
+        f"{len(records)} cases: {len(missed)} scored lower than the exhaustive search, "
+        f"{len(elsewhere)} of them elsewhere; {higher} scored higher; {ratio:.1f} times as fast "
+        "(median of CPU time)"
+    )
     for r in missed:
-        print(f"  {r['kind']} {r['width']:.0f} m: {r['score']:.0f} instead of "
-              f"{r['exhaustive']:.0f}, {r['metres_apart']:.1f} m away")
+        print(
+            f"  {r['kind']} {r['width']:.0f} m: {r['score']:.0f} instead of "
+            f"{r['exhaustive']:.0f}, {r['metres_apart']:.1f} m away"
+        )
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ from commonmap.matching.evidence_fft import (
     evidence_peaks,
     evidence_surface,
     evidence_surfaces,
+    peaks_on_each,
     plan_lanes,
     transform_target,
 )
@@ -34,6 +35,7 @@ from commonmap.matching.slabs import (
     SlabGrid,
     coarsen,
     list_columns,
+    mirror_grid,
     pack_slabs,
     scatter,
     unpack,
@@ -261,6 +263,27 @@ def test_peaks_are_those_of_the_surface(seed: int) -> None:
         told = index[:, 0] >= 0
         assert peaks[:, :2].tolist() == index[told].tolist()
         assert peaks[:, 2].tolist() == value[told].tolist()
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_targets_side_by_side_have_the_peaks_that_each_has_alone(seed: int) -> None:
+    # known alike in all slabs and not, an empty slab, double precision: what lanes they share varies
+    rng = np.random.default_rng([seed, 79])
+    n_slabs, shape, side = int(rng.integers(2, 8)), (23, 19), (9, 8)
+    grids = [packed(*random_slabs(rng, n_slabs, shape, shared=bool(k % 2))) for k in range(3)]
+    occupied, known = random_slabs(rng, n_slabs, shape, shared=True)
+    occupied[0] = False
+    grids += [packed(occupied, known), mirror_grid(grids[1])]
+    spectra = [transform_target(grid, side) for grid in grids]
+    spectra.append(transform_target(grids[0], side, n_source=10**13))
+    turned = packed(*random_slabs(rng, n_slabs, side, shared=True))
+    bits = np.repeat(turned.occupied[..., None], 3, 2), np.repeat(turned.known[..., None], 3, 2)
+    rim = (0, 1, 1, 0)
+    found = peaks_on_each(spectra, *bits, rim, 5, min_overlap=4.0)
+    for one, on_it in zip(spectra, found, strict=True):
+        alone = evidence_peaks(one, *bits, rim, 5, min_overlap=4.0)
+        assert [peaks.tobytes() for peaks in on_it] == [peaks.tobytes() for peaks in alone]
+        assert all(len(peaks) > 0 for peaks in on_it)
 
 
 def test_the_bound_holds_where_the_evidence_is_all_there_is() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -82,3 +83,41 @@ def test_normals_on_demand_are_those_of_all() -> None:
         which = rng.integers(0, len(every), 900)
         assert np.array_equal(normals[which], every[which])
     assert normals[np.zeros(0, np.int64)].shape == (0, 3)
+
+
+def test_a_query_skips_what_holds_nothing_and_no_more() -> None:
+    # a ring of points with nothing for 20 m within, and one point far outside
+    rng = np.random.default_rng(5)
+    turn = rng.uniform(0.0, 2.0 * np.pi, 3000)
+    ring = np.column_stack([20.0 * np.cos(turn), 20.0 * np.sin(turn), rng.uniform(0, 3, 3000)])
+    xyz = np.concatenate([ring, [[70.0, 3.0, 1.0]]])
+    index = index_points(xyz, 0.3)
+    assert index.gap.max() > 30  # columns of half a metre
+    asked = np.concatenate([rng.uniform(-21, 21, (500, 3)), rng.uniform(-90, 90, (200, 3))])
+    for reach in (0.5, 9.0, math.inf):
+        distance, number = index.query(asked, distance_upper_bound=reach)
+        expected, which = cKDTree(xyz).query(asked, distance_upper_bound=reach)
+        assert np.array_equal(number, which)
+        assert distance == pytest.approx(expected)
+
+
+def test_gaps_by_hand() -> None:
+    # two points, 1 m columns of 5 x 3: the farther way to the nearer one counts
+    xyz = np.array([[0.5, 0.5, 0.0], [4.5, 2.5, 0.0]])
+    index = index_points(xyz, 2.0 / 3.0)
+    assert index.shape == (5, 3)
+    assert index.gap.reshape(5, 3).tolist() == [
+        [0, 1, 2], [1, 1, 2], [2, 2, 2], [2, 1, 1], [2, 1, 0],
+    ]  # fmt: skip
+
+
+def test_threads_may_share_normals() -> None:
+    xyz = surfaces(4)
+    index = index_points(xyz, 0.1)
+    expected = find_normals(index, 20)
+    rng = np.random.default_rng(6)
+    wanted = [rng.integers(0, len(xyz), 400) for _ in range(40)]
+    normals = Normals(index, 20)
+    with ThreadPoolExecutor(8) as pool:
+        for which, found in zip(wanted, pool.map(normals.__getitem__, wanted), strict=True):
+            assert np.array_equal(found, expected[which])

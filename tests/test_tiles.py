@@ -22,7 +22,7 @@ from commonmap.matching import arrays, tiles
 from commonmap.matching.evidence_fft import bytes_held, evidence_surface, transform_target
 from commonmap.matching.lane_fft import find_length
 from commonmap.matching.peaks import local_maxima
-from commonmap.matching.search import Peaks, plan_search, search
+from commonmap.matching.search import Peaks, plan_search, search, search_both
 from commonmap.matching.slabs import (
     Columns,
     SlabGrid,
@@ -30,6 +30,7 @@ from commonmap.matching.slabs import (
     coarse_window,
     coarsen,
     list_columns,
+    mirror_grid,
     pack_slabs,
     scatter,
 )
@@ -138,8 +139,8 @@ def test_peaks_of_tiles_are_the_peaks_of_the_whole_surface(seed: int, extent: in
         for u in range(0, n_u, extent)
         for v in range(0, n_v, extent)
     )
-    found = search_tiles(
-        find_level(base, 1, IN_ONE_PIECE), sweep, parts, compute=IN_ONE_PIECE, workers=2,
+    (found,) = search_tiles(
+        (find_level(base, 1, IN_ONE_PIECE),), sweep, parts, compute=IN_ONE_PIECE, workers=2,
         progress=no_progress,
     )  # fmt: skip
     spectra = transform_target(base, (sweep.side, sweep.side))
@@ -158,12 +159,15 @@ def test_peaks_of_tiles_are_the_peaks_of_the_whole_surface(seed: int, extent: in
 
 
 @pytest.mark.parametrize("least", [1.0, 7.3, 60.0, 1e6])
-def test_the_rim_of_all_yaws_is_that_of_the_turned_sources(least: float) -> None:
+@pytest.mark.parametrize("n_yaws", [3, 4, 6, 24])
+def test_the_rim_of_all_yaws_is_that_of_the_turned_sources(least: float, n_yaws: int) -> None:
     draft = cut(BASE, slice(0, 26), slice(2, 28))
     draft.known[np.add.outer(np.arange(26), np.arange(26)) < 20] = 0  # a corner is missing
-    sweep = replace(sweep_of(draft, 0.5, 3), min_pairs=least)
+    sweep = replace(sweep_of(draft, 0.5, n_yaws), min_pairs=least)
     masks = [turn_columns(sweep, yaw[None])[1][..., 0] > 0 for yaw in sweep.yaws]
     expected = arrays.find_rim(masks, (sweep.side, sweep.side), max(1, math.ceil(least)))
+    if n_yaws % 4 == 0:  # what is a row at one yaw is a column at another
+        assert min(expected) == max(expected)
     assert find_turned_rim(sweep) == expected
     assert (expected[0] == sweep.side) == (least == 1e6)
 
@@ -202,6 +206,36 @@ def test_the_search_in_little_memory_gives_the_same_bytes(
     assert same_bytes(found, whole)
     assert told == sorted(told)
     assert told[-1] == 1.0
+
+
+@pytest.mark.parametrize("compute", [IN_ONE_PIECE, IN_LITTLE])
+def test_both_sides_at_once_are_what_each_is_alone(compute: ComputeConfig) -> None:
+    both = search_both(BASE, DRAFT, min_overlap=0.1, compute=compute)
+    for mirrored, found in zip((False, True), both, strict=True):
+        alone = search(BASE, DRAFT, min_overlap=0.1, mirrored=mirrored, compute=compute)
+        assert same_bytes(found, alone)
+    assert not same_bytes(*both)
+
+
+@pytest.mark.parametrize("factor", [1, 2, 4])
+def test_a_mirrored_level_is_the_level_of_the_mirrored_target(factor: int) -> None:
+    for compute in (IN_ONE_PIECE, NOTHING_WHOLE):
+        level = find_level(BASE, factor, compute).mirror()
+        expected = coarsen(mirror_grid(BASE), factor)
+        assert level.shape == expected.shape
+        assert level.origin == pytest.approx(expected.origin, abs=1e-12)
+        window = level.window((2, 7), (1, 9))
+        assert np.array_equal(window.occupied, expected.occupied[2:7, 1:9])
+        assert np.array_equal(window.known, expected.known[2:7, 1:9])
+        corner = expected.origin + np.array([2, 1]) * expected.cell
+        assert window.origin == pytest.approx(corner, abs=1e-12)
+    # by hand: cell [0, 0] of 0.25 m at x = -1 ends at -0.75, reflected at 0.75 to 1
+    grid = SlabGrid(
+        np.array([-1.0, 2.0]), 0.25, *(np.arange(6, dtype=np.uint32).reshape(3, 2),) * 2, 3
+    )
+    mirrored = mirror_grid(grid)
+    assert mirrored.origin.tolist() == [0.25, 2.0]
+    assert mirrored.occupied.tolist() == [[4, 5], [2, 3], [0, 1]]
 
 
 def test_climbs_read_windows_of_a_target_too_large_to_keep() -> None:
@@ -266,8 +300,9 @@ def test_counts_that_single_precision_cannot_tell_are_taken_in_double() -> None:
 
 @pytest.mark.parametrize("double", [False, True])
 @pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize("n_targets", [1, 2])
 def test_a_tile_holds_no_more_than_planned(
-    double: bool, shared: bool, monkeypatch: pytest.MonkeyPatch
+    n_targets: int, double: bool, shared: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
         "commonmap.matching.evidence_fft.rounding", lambda *a: 1.0 if double else 0.1
@@ -278,10 +313,13 @@ def test_a_tile_holds_no_more_than_planned(
     sweep = sweep_of(cut(base, slice(100, 130), slice(100, 130)), 0.5, 3)
     shape = (500 + sweep.side - 1, 480 + sweep.side - 1)
     tile = Tile((0, shape[0]), (0, shape[1]))
-    plan = plan_tiles(base.shape, sweep.side, 3, shared=shared, compute=IN_ONE_PIECE, workers=1)
-    task = Task(base, tile, tile, sweep, (0, 0, 0))
+    plan = plan_tiles(
+        base.shape, sweep.side, 3, shared=shared, compute=IN_ONE_PIECE, workers=1,
+        n_targets=n_targets,
+    )  # fmt: skip
+    task = Task((base, mirror_grid(base))[:n_targets], tile, tile, sweep, (0, 0, 0))
     size = find_length(shape[0]), find_length(shape[1])
-    planned = bytes_held(size, sweep.side, 3, shared=shared, workers=1)
+    planned = bytes_held(size, sweep.side, 3, shared=shared, workers=1, n_targets=n_targets)
     assert planned <= plan.n_bytes <= 1.2 * planned
     search_tile(task)  # compiled
     arrays._own.__dict__.clear()
