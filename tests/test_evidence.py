@@ -267,7 +267,7 @@ def test_peaks_are_those_of_the_surface(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(12))
 def test_targets_side_by_side_have_the_peaks_that_each_has_alone(seed: int) -> None:
-    # known alike in all slabs and not, an empty slab, double precision: what lanes they share varies
+    # known alike in all slabs and not, an empty slab, double precision: lanes are shared or not
     rng = np.random.default_rng([seed, 79])
     n_slabs, shape, side = int(rng.integers(2, 8)), (23, 19), (9, 8)
     grids = [packed(*random_slabs(rng, n_slabs, shape, shared=bool(k % 2))) for k in range(3)]

@@ -143,6 +143,8 @@ def test_the_mirrored_search_finds_a_mirrored_map_and_not_the_true_one() -> None
     at = undone.centre * np.array([-1.0, 1.0])
     expected = moved(T, np.array([[*at, 0.0]]))[0, :2]
     assert np.hypot(*(undone.pose[0, :2] - expected)) < 0.6
+    turned = undone.pose[0, 2] - math.atan2(T[1, 0], T[0, 0])
+    assert abs(math.remainder(turned, 2.0 * math.pi)) < math.radians(2.0)
 
 
 def test_poses_under_the_least_overlap_are_not_proposed() -> None:

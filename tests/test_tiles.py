@@ -160,16 +160,22 @@ def test_peaks_of_tiles_are_the_peaks_of_the_whole_surface(seed: int, extent: in
 
 @pytest.mark.parametrize("least", [1.0, 7.3, 60.0, 1e6])
 @pytest.mark.parametrize("n_yaws", [3, 4, 6, 24])
-def test_the_rim_of_all_yaws_is_that_of_the_turned_sources(least: float, n_yaws: int) -> None:
+@pytest.mark.parametrize("askew", [False, True])
+def test_the_rim_of_all_yaws_is_that_of_the_turned_sources(
+    least: float, n_yaws: int, askew: bool
+) -> None:
     draft = cut(BASE, slice(0, 26), slice(2, 28))
     draft.known[np.add.outer(np.arange(26), np.arange(26)) < 20] = 0  # a corner is missing
+    if askew:  # a strip at 30 degrees: its long side is a column where its short one is a row
+        x, y = np.meshgrid(np.arange(26) - 12.5, np.arange(26) - 12.5, indexing="ij")
+        draft.known[np.abs(y * np.cos(0.5236) - x * np.sin(0.5236)) > 4.0] = 0
     sweep = replace(sweep_of(draft, 0.5, n_yaws), min_pairs=least)
     masks = [turn_columns(sweep, yaw[None])[1][..., 0] > 0 for yaw in sweep.yaws]
     expected = arrays.find_rim(masks, (sweep.side, sweep.side), max(1, math.ceil(least)))
     if n_yaws % 4 == 0:  # what is a row at one yaw is a column at another
         assert min(expected) == max(expected)
     assert find_turned_rim(sweep) == expected
-    assert (expected[0] == sweep.side) == (least == 1e6)
+    assert (expected[0] == sweep.side) == (max(mask.sum() for mask in masks) < least)
 
 
 def test_equal_peaks_of_two_tiles_keep_the_order_of_one_piece() -> None:

@@ -11,11 +11,12 @@ import numpy as np
 
 from commonmap.matching.figures import other_poses
 from commonmap.matching.search import (
-    BUDGET,
     KEEP,
     Peaks,
+    SearchPlan,
     centre_columns,
     evidence_at,
+    plan_part,
     plan_search,
     search,
 )
@@ -44,8 +45,9 @@ def measure_halves(
         return None
     along = _along(columns.xy, columns.xy[standing])
     upper = along > np.median(along[standing])
+    plan = plan_search(target, source)
     first, second = (
-        _ratio(target, grid, _part_of(source, over & side), found, cell, workers)
+        _ratio(target, grid, _part_of(source, over & side), found, plan, cell, workers)
         for side in (~upper, upper)
     )
     return first, second
@@ -86,10 +88,12 @@ def _part_of(source: SlabGrid, kept: Bools) -> SlabGrid:
 
 
 def _ratio(
-    target: SlabGrid, grid: SlabGrid, half: SlabGrid, found: Peaks, cell: float, workers: int
-) -> float:
+    target: SlabGrid, grid: SlabGrid, half: SlabGrid, found: Peaks, plan: SearchPlan, cell: float,
+    workers: int,
+) -> float:  # fmt: skip
     """Return the half's best evidence near the pose of `found` over its best anywhere else."""
-    plan = plan_search(target, half, budget=BUDGET / 4.0, keep=KEEP // 4)
+    # on finer cells it would cost as much as the whole; on coarser ones it may miss its best pose
+    plan = plan_part(plan, half, keep=KEEP // 4)
     peaks = search(target, half, min_overlap=HALF_OVERLAP, plan=plan, workers=workers)
     middle = found.T_target_source() @ np.array([*peaks.centre, 0.0, 1.0])
     pose = np.array([*middle[:2], found.pose[0, 2]])

@@ -91,19 +91,33 @@ def plan_search(
     cells times yaws times layers), and leaves at least 16 cells along the source. keep: poses that
     climb on it; on every finer one a quarter of these, but at least a tenth of `keep`.
     """
-    columns = list_columns(source)
-    radius = _radius(columns)
+    radius = _radius(list_columns(source))
     cell = 2.0 * target.cell
     cells = [cell]
     while True:
-        n_yaw = WIDTH * -(-count_yaws(radius, cells[0]) // WIDTH)  # as many as go side by side
+        n_yaw = _yaws_side_by_side(radius, cells[0])
         side = [n * target.cell / cells[0] + 2.0 * radius / cells[0] for n in target.shape]
         cost = side[0] * side[1] * n_yaw * (4 * target.n_slabs)
         if cost <= budget or 2.0 * radius / (2.0 * cells[0]) < 16:
             break
         cells.insert(0, 2.0 * cells[0])
-    climbing = tuple(max(3 * keep // 32, keep >> (2 * level)) for level in range(len(cells)))
-    return SearchPlan(tuple(cells), n_yaw, climbing)
+    return SearchPlan(tuple(cells), n_yaw, _climbing(keep, len(cells)))
+
+
+def _climbing(keep: int, n_cells: int) -> tuple[int, ...]:
+    """Return how many poses climb on each cell."""
+    return tuple(max(3 * keep // 32, keep >> (2 * level)) for level in range(n_cells))
+
+
+def _yaws_side_by_side(radius: float, cell: float) -> int:
+    """Return how many yaws, rounded up to as many as go side by side."""
+    return WIDTH * -(-count_yaws(radius, cell) // WIDTH)
+
+
+def plan_part(plan: SearchPlan, part: SlabGrid, *, keep: int) -> SearchPlan:
+    """Return the plan for a part of a source, on the cells of the plan for the whole."""
+    n_yaw = _yaws_side_by_side(_radius(list_columns(part)), plan.cells[0])
+    return SearchPlan(plan.cells, n_yaw, _climbing(keep, len(plan.cells)))
 
 
 def plan_glance(target: SlabGrid, source: SlabGrid) -> SearchPlan:
