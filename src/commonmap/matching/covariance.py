@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from commonmap.frames import from_rotation
-from commonmap.mapping.points import move, sample
+from commonmap.mapping.points import bounds, move, sample
 from commonmap.matching.neighbours import Normals, PlanIndex
 from commonmap.types import Float64s
 
@@ -139,8 +139,9 @@ def measure_covariance(
     """Return the covariance (6, 6) of a pose T that the pairs settled on, metres and radians."""
     K_inverse = _invert_grip(pairs.curvature(), *_grip(surface, source, T, pairs, reach, spacing))
     # the shape of B from patches of all widths, its size from the width that says the most
-    xy, pulls = pairs.p[:, :2], pairs.pulls()
-    spreads = [_spread(xy, pulls, n) for n in PATCHES]
+    pulls, (low, high) = pairs.pulls(), bounds(pairs.p)
+    xy, size = (pairs.p - low)[:, :2], float((high - low)[:2].max())
+    spreads = [_spread(xy, pulls, size, n) for n in PATCHES]
     sizes = [float(np.trace(K_inverse @ B)) for B in spreads]
     B = np.mean(spreads, axis=0) * (max(sizes) / max(float(np.mean(sizes)), 1e-300))
     covariance = K_inverse @ B @ K_inverse + SMALLEST + _common(pairs.scale)
@@ -153,11 +154,12 @@ def _common(scale: float) -> Float64s:
     return np.asarray(np.diag([COMMON**2 * loose] * 2 + [0.0] * 4))
 
 
-def _spread(xy: Float64s, pulls: Float64s, n_side: int) -> Float64s:
-    """Return the covariance (6, 6) of the summed pulls, from what patches of the plan pull."""
-    low, high = xy.min(axis=0), xy.max(axis=0)
-    size = max(float((high - low).max()) / n_side, 1e-6)
-    ij = ((xy - low) / size).astype(np.int64)
+def _spread(xy: Float64s, pulls: Float64s, side: float, n_side: int) -> Float64s:
+    """Return the covariance (6, 6) of the summed pulls, from what patches of the plan pull.
+
+    xy: (M, 2) metres, from the plan's lower corner. side: of the plan, the longer one.
+    """
+    ij = (xy / max(side / n_side, 1e-6)).astype(np.int64)
     patch = ij[:, 0] * (n_side + 1) + ij[:, 1]
     n = np.count_nonzero(np.bincount(patch))
     each = np.stack([np.bincount(patch, weights=column) for column in pulls.T])

@@ -259,12 +259,14 @@ def settle(
     def widened(xyz: Float64s, most: int) -> float:
         return max(fine, apart * math.sqrt(len(xyz) / most))
 
-    source = move(way.start, source_xyz) - way.centre
+    T_about_target = from_rotation(np.eye(3), -way.centre)
+    source = move(T_about_target @ way.start, source_xyz)
     source = thin(source, widened(source, n_most), n_most)
     surface, reach, spacing = way.surface, 0.75 * way.cell, walking_voxel(way.cell)
     if 4.0 * way.pairs.scale < reach:
         reach, spacing = max(4.0 * way.pairs.scale, 2.0 * fine), fine
-        there = rows_of(target_xyz, inside_box(target_xyz, way.low, way.high)) - way.centre
+        inside = inside_box(target_xyz, way.low, way.high)
+        there = move(T_about_target, rows_of(target_xyz, inside))
         voxel = widened(there, 2 * n_most)
         surface = find_surface(thin(there, voxel, 2 * n_most), voxel)
     few = sample(source, MOST_ARRIVING)
