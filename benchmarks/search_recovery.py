@@ -55,7 +55,7 @@ def crops(place: int, n: int) -> Iterator[tuple[dict[str, Any], SlabGrid, SlabGr
         cell, edges, max_height = choose_grid(base, draft, config)
         cell = max(cell, 0.5)
         layers = [build_layers(item, cell, edges, max_height) for item in (base, draft)]
-        if all(each.grid["slab_occupied"].any() for each in layers):
+        if all(each.slabs.occupied.any() for each in layers):
             case |= {"cell": cell, "under_1_m": bool(crop % 2)}
             yield case, layers[0].slabs, layers[1].slabs
 

@@ -7,7 +7,7 @@ held-out areas lie measurably better with it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -206,7 +206,7 @@ def _match_alone(
     source = find_source(own, cell)
     way = walk(there.surface, source.walkers, T, cell=cell)
     refined = settle(way, there.points.xyz, own.xyz, n_most=16_000, apart=own.voxel)
-    part = Layers(layers[1].grid, slabs)
+    part = replace(layers[1], slabs=slabs)
     figures = with_looks(
         measure_figures(layers[0], part, found, found, decoy, cell),
         look_at(base, there, source, way, refined, cell),

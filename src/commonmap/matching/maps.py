@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -10,11 +12,16 @@ from commonmap.config import Config
 from commonmap.errors import EmptyMapError, InputError
 from commonmap.frames import from_rotation
 from commonmap.mapping.ground import Ground, find_ground
-from commonmap.mapping.height_map import build_height_map, choose_cell, choose_slabs
+from commonmap.mapping.height_map import (
+    build_height_map,
+    choose_cell,
+    choose_slabs,
+    find_slabs,
+)
 from commonmap.mapping.level import MOST_POINTS as LEVEL_POINTS
 from commonmap.mapping.level import Levelling, find_level, no_levelling
 from commonmap.mapping.points import bounds, inside_box, move, points_of, rows_of, sample, thin
-from commonmap.matching.slabs import SlabGrid, pack_slabs
+from commonmap.matching.slabs import SlabGrid
 from commonmap.metrics.table import METRICS
 from commonmap.types import Bools, Cloud, Float64s, GridMap, Leaves
 
@@ -38,10 +45,18 @@ class Prepared:
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """One map's layers for the search: height map and slabs on half the cell."""
+    """One map's layers for the search: slabs and height map on half the cell.
 
-    grid: GridMap
+    build_grid: returns the height map; few searches need it.
+    """
+
     slabs: SlabGrid
+    build_grid: Callable[[], GridMap]
+
+    @cached_property
+    def grid(self) -> GridMap:
+        """Return the height map, built when it is asked for first."""
+        return self.build_grid()
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,12 +124,18 @@ def choose_grid(
 
 def build_layers(item: Prepared, cell: float, edges: Float64s, max_height: float | None) -> Layers:
     """Return the layers of a prepared map on half of `cell`."""
-    grid = build_height_map(
-        item.xyz, cell=0.5 * cell, slab_edges=edges, ground=item.ground, max_height=max_height,
-        height=item.height,
+    half = 0.5 * cell
+    origin, occupied, known = find_slabs(
+        item.xyz, item.height, cell=half, slab_edges=edges, max_height=max_height
+    )
+    slabs = SlabGrid(origin, half, occupied, known, len(edges) - 1)
+    return Layers(
+        slabs,
+        lambda: build_height_map(
+            item.xyz, cell=half, slab_edges=edges, ground=item.ground, max_height=max_height,
+            height=item.height,
+        ),
     )  # fmt: skip
-    slabs = pack_slabs(grid.origin, grid.cell, grid["slab_occupied"], grid["slab_known"])
-    return Layers(grid, slabs)
 
 
 def choose_points(

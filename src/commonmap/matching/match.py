@@ -145,8 +145,8 @@ def _search_both(
     At a glance where that tells, else of the whole search. Raises EmptyMapError where nothing
     stands on one of the maps.
     """
-    if not draft.grid["slab_occupied"].any() or not base.grid["slab_occupied"].any():
-        side = "source" if not draft.grid["slab_occupied"].any() else "target"
+    if not draft.slabs.occupied.any() or not base.slabs.occupied.any():
+        side = "source" if not draft.slabs.occupied.any() else "target"
         raise EmptyMapError(
             f"nothing stands on the ground of the {side} map between "
             f"{base.grid.slab_edges[0]:.2g} and {base.grid.slab_edges[-1]:.2g} m; "  # type: ignore[index]
