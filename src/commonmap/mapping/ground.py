@@ -61,7 +61,7 @@ def find_ground(xyz: Float64s, *, cell: float | None = None) -> Ground:
     if len(xyz) < 3:
         raise EmptyMapError(f"a map needs at least three points to have a ground; {len(xyz)} came")
     if cell is None:
-        cell = max(0.5, 1.5 * typical_spacing(xyz))
+        cell = choose_ground_cell(typical_spacing(xyz))
     low, high = bounds(xyz)
     origin = np.floor(low[:2] / cell) * cell
     shape = tuple(np.floor((high[:2] - origin) / cell).astype(int) + 1)
@@ -83,6 +83,11 @@ def find_ground(xyz: Float64s, *, cell: float | None = None) -> Ground:
         candidate &= lowest - smooth <= 2.0 * tolerance
         z = fill(np.where(candidate, lowest, np.nan))
     return Ground(origin=origin, cell=cell, z=z, seen=candidate)
+
+
+def choose_ground_cell(spacing: float) -> float:
+    """Return the cell of a ground under points so far apart, metres."""
+    return max(0.5, 1.5 * spacing)
 
 
 def typical_spacing(xyz: Float64s) -> float:

@@ -28,13 +28,17 @@ NICE_CELLS = (0.05, 0.1, 0.2, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 """Cell sizes to choose from, metres."""
 
 
-def choose_cell(target_xyz: Float64s, source_xyz: Float64s) -> float:
+def choose_cell(
+    target_xyz: Float64s, source_xyz: Float64s, *, spacing: float | None = None
+) -> float:
     """Return the cell size in metres for matching two clouds, from their density and extent.
 
     A cell should be hit by about ten points in the sparser map, and no finer than the shape of
     the source can be trusted over its extent (an odometry drifts about 1 % of the way).
+    spacing: of the sparser map's points, metres, where the caller has it already.
     """
-    spacing = max(typical_spacing(target_xyz), typical_spacing(source_xyz))
+    if spacing is None:
+        spacing = max(typical_spacing(target_xyz), typical_spacing(source_xyz))
     extent = min(robust_extent(target_xyz), robust_extent(source_xyz))
     wish = max(3.0 * spacing, extent / 120.0)
     fitting = [c for c in NICE_CELLS if c >= wish * 0.999]
@@ -57,7 +61,7 @@ def choose_slabs(heights: Float64s, *, cell: float, max_height: float | None = N
     lowest = 0.25 if max_height is None or max_height > 1.0 else 0.2 * max_height
     if max_height is not None and max_height <= 2.0:
         return np.linspace(lowest, max_height, 5)
-    few = sample(heights, 500_000)
+    few = sample(heights, 100_000)
     above = few[few > lowest]
     top = float(np.quantile(above, 0.99)) if len(above) else 1.0
     if max_height is not None:

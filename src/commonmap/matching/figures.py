@@ -8,17 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from commonmap.frames import apply
-from commonmap.mapping.points import sample_where
+from commonmap.mapping.points import sample
 from commonmap.matching.decide import Figures
 from commonmap.matching.inliers import share_of_inliers
-from commonmap.matching.maps import Layers, Points, Prepared
+from commonmap.matching.maps import MOST_LOW, Layers, Points, Prepared
 from commonmap.matching.search import Peaks, centre_columns, evidence_at
 from commonmap.matching.slabs import coarsen, list_columns
 from commonmap.matching.support import measure_support
 from commonmap.types import Bools, Float64s
-
-LOW = 0.3
-"""Metres above ground under which a point is the ground's."""
 
 CLEAR_BY = 4.0
 """How many times the score of the mirrored source's best pose, and of the best pose elsewhere, the
@@ -69,8 +66,8 @@ def measure_figures(
 
 def lift_mirrored(T_planar: Float64s, base: Prepared, mirrored: Points) -> Float64s:
     """Return the planar motion of the mirrored source with z set by its ground."""
-    low = np.abs(mirrored.height) < LOW
-    moved = apply(T_planar, sample_where(mirrored.xyz, low | ~low.any(), 20_000))
+    low = mirrored.low if len(mirrored.low) else np.arange(len(mirrored.xyz))
+    moved = apply(T_planar, mirrored.xyz[sample(low, MOST_LOW)])
     lifted = T_planar.copy()
     lifted[2, 3] += float(np.median(base.ground.height_at(moved[:, :2]) - moved[:, 2]))
     return lifted

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from commonmap.config import Config
 from commonmap.errors import EmptyMapError, InputError
 from commonmap.frames import from_rotation
-from commonmap.mapping.ground import Ground, find_ground
+from commonmap.mapping.ground import Ground, choose_ground_cell, find_ground, typical_spacing
 from commonmap.mapping.height_map import (
     build_height_map,
     choose_cell,
@@ -28,12 +29,19 @@ from commonmap.types import Bools, Cloud, Float64s, GridMap, Leaves
 MOST_POINTS = 1_000_000
 """Points of a map that the refinement and the verdict look at."""
 
+LOW = 0.3
+"""Metres above ground under which a point is the ground's."""
+
+MOST_LOW = 20_000
+"""Points of the ground that are laid on another ground."""
+
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
     """A map made ready: level, near its own origin, with its ground.
 
     xyz: (N, 3) metres, in the prepared frame. T_prepared_map: (4, 4) takes the map's points there.
+    height: (N,) metres above its ground. spacing: metres between its points, seen from above.
     """
 
     xyz: Float64s
@@ -41,6 +49,7 @@ class Prepared:
     ground: Ground
     height: Float64s
     levelling: Levelling
+    spacing: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +81,11 @@ class Points:
     standing: Bools
     voxel: float
 
+    @cached_property
+    def low(self) -> NDArray[np.int64]:
+        """Return which points are the ground's, some of them if there are many."""
+        return np.asarray(sample(np.flatnonzero(np.abs(self.height) < LOW), MOST_LOW))
+
     def where(self, wanted: Bools) -> Points:
         """Return the wanted ones, (M,) bool."""
         return Points(
@@ -82,7 +96,7 @@ class Points:
 def prepare(item: Cloud | Leaves | Float64s, name: str, config: Config) -> Prepared:
     """Return a map with its points level and near the origin, and its ground."""
     xyz = points_of(item, name)
-    middle = np.round(np.median(sample(xyz, 100_000), axis=0))
+    middle = np.round(np.median(sample(xyz, 20_000), axis=0))
     low, high = bounds(xyz)
     extent = (high - low)[:2]
     if len(xyz) < 100 or float(extent.max()) < 1.0:
@@ -102,9 +116,10 @@ def prepare(item: Cloud | Leaves | Float64s, name: str, config: Config) -> Prepa
         levelling = find_level(sample(xyz, LEVEL_POINTS))
     T_prepared_map = levelling.T_level_map @ from_rotation(np.eye(3), -middle)
     local = move(T_prepared_map, xyz)
-    ground = find_ground(local)
+    spacing = typical_spacing(local)
+    ground = find_ground(local, cell=choose_ground_cell(spacing))
     height = ground.height_above(local)
-    return Prepared(local, T_prepared_map, ground, height, levelling)
+    return Prepared(local, T_prepared_map, ground, height, levelling, spacing)
 
 
 def choose_grid(
@@ -114,7 +129,8 @@ def choose_grid(
 
     Metrics on height maps use heights under 1 m unless told otherwise, as the source paper does.
     """
-    cell = config.grid.resolution or choose_cell(base.xyz, draft.xyz)
+    spacing = max(base.spacing, draft.spacing)
+    cell = config.grid.resolution or choose_cell(base.xyz, draft.xyz, spacing=spacing)
     max_height = config.grid.max_height
     if max_height is None and METRICS[config.search.metric].layers != "slabs":
         max_height = 1.0

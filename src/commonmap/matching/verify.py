@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from commonmap.mapping.points import move, sample_where, thin
+from commonmap.mapping.points import move, thin
 from commonmap.matching.covariance import Surface
 from commonmap.matching.decide import Figures, is_lost, is_open, rank_value
 from commonmap.matching.figures import (
-    LOW,
     lift_mirrored,
     measure_figures,
     measure_inliers,
@@ -302,8 +301,7 @@ def ground_misfit(base: Prepared, points: Points, T_target_source: Float64s) -> 
     base measured; a constant step between the two does not count. None where fewer than 50 points
     tell.
     """
-    low = sample_where(points.xyz, np.abs(points.height) < LOW, 20_000)
-    placed = move(T_target_source, low)
+    placed = move(T_target_source, points.xyz[points.low])
     ground = base.ground
     ij = np.floor((placed[:, :2] - ground.origin) / ground.cell).astype(np.int64)
     inside = ((ij >= 0) & (ij < ground.z.shape)).all(axis=1)
