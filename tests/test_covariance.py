@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from commonmap.frames import from_xyz_yaw
 from commonmap.matching.covariance import (
     SMALLEST,
     Pairs,
@@ -64,6 +65,20 @@ def test_residuals_and_weights_by_hand() -> None:
     assert pairs.curvature()[2, 2] == pytest.approx(0.0)  # the pull is largest at twice the scale
     assert pair_points(surface, source[:19], np.eye(4), reach=1.0) is None
     assert pair_points(surface, source, np.eye(4), reach=0.1) is None
+
+
+def test_a_surface_seen_from_elsewhere_is_the_surface_moved_there() -> None:
+    rng = np.random.default_rng(4)
+    points, normals = corner(rng, 0.0)
+    origin = np.array([7.0, -3.0, 2.0])
+    source = points[::5] - origin + rng.normal(0.0, 0.1, points[::5].shape)
+    here = Surface(points - origin, normals, cKDTree(points - origin))
+    seen = Surface(points, normals, cKDTree(points)).about(origin)
+    T = from_xyz_yaw(0.1, 0.05, -0.1, 0.01)
+    one, other = (pair_points(surface, source, T, reach=1.0) for surface in (here, seen))
+    assert one is not None and other is not None
+    for name in ("p", "J", "w", "r"):
+        assert getattr(one, name) == pytest.approx(getattr(other, name), abs=1e-9)
 
 
 def test_a_floor_of_noisy_normals_has_no_grip_sideways() -> None:

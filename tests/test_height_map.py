@@ -16,9 +16,11 @@ from commonmap.mapping.height_map import (
     build_height_map,
     choose_cell,
     choose_slabs,
+    find_slabs,
     robust_extent,
 )
 from commonmap.mapping.points import points_of
+from commonmap.matching.slabs import pack_slabs
 from commonmap.types import Cloud, Float64s, GridMap, Leaves
 
 EDGES = np.array([0.25, 0.5, 1.0, 2.0])
@@ -188,6 +190,40 @@ def test_height_map_equals_its_slow_twin(case: tuple[Float64s, float, float | No
             inside = any(EDGES[k] <= h < EDGES[k + 1] for h in z)
             assert grid["slab_occupied"][k, i, j] == inside
             assert grid["slab_known"][k, i, j]
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(point_sets())
+def test_slabs_alone_are_those_of_the_height_map(
+    case: tuple[Float64s, float, float | None],
+) -> None:
+    points, cell, max_height = case
+    ground = flat()
+    height = ground.height_above(points)
+    try:
+        grid = build_height_map(
+            points, cell=cell, slab_edges=EDGES, ground=ground, max_height=max_height
+        )
+    except EmptyMapError as problem:
+        with pytest.raises(EmptyMapError) as told:
+            find_slabs(points, height, cell=cell, slab_edges=EDGES, max_height=max_height)
+        assert str(told.value) == str(problem)
+        return
+    expected = pack_slabs(grid.origin, cell, grid["slab_occupied"], grid["slab_known"])
+    origin, occupied, known = find_slabs(
+        points, height, cell=cell, slab_edges=EDGES, max_height=max_height
+    )
+    assert origin.tolist() == grid.origin.tolist()
+    assert np.array_equal(occupied, expected.occupied)
+    assert np.array_equal(known, expected.known)
+
+
+def test_thirty_two_slabs_alone() -> None:
+    points = np.array([[0.5, 0.5, 31.5], [0.5, 0.5, 0.0]])
+    edges = np.linspace(0.0, 32.0, 33)
+    _, occupied, known = find_slabs(points, points[:, 2], cell=1.0, slab_edges=edges)
+    assert occupied.tolist() == [[0x80000001]]
+    assert known.tolist() == [[0xFFFFFFFF]]
 
 
 @pytest.mark.parametrize("cell", [0.0, -1.0, math.nan, math.inf])

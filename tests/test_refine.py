@@ -24,7 +24,15 @@ from commonmap.mapping.points import (
 )
 from commonmap.matching.covariance import Pairs, pair_points
 from commonmap.matching.inliers import share_of_inliers
-from commonmap.matching.refine import lift, refine
+from commonmap.matching.refine import (
+    choose_walkers,
+    find_surface,
+    lift,
+    refine,
+    settle,
+    walk,
+    walking_voxel,
+)
 from commonmap.types import Float64s
 from matching_scenes import apart, look, make_place, moved, rigid
 
@@ -113,6 +121,43 @@ def test_two_noisy_looks_agree_to_centimetres() -> None:
     assert refined.converged
     assert metres < 0.03
     assert degrees < 0.1
+
+
+def test_walkers_are_one_point_a_voxel_and_fewer_on_the_wider_one() -> None:
+    rng = np.random.default_rng(8)
+    cloud = yard(rng)
+    walkers = choose_walkers(cloud, 0.9)
+    some = thin(cloud, 0.3)
+    assert len(some) < 8_000
+    assert np.array_equal(walkers.some, some)
+    assert np.array_equal(walkers.few, thin(some, 0.9))
+    T = rigid(3.0, -2.0, 0.5, 0.3)
+    for name in ("few", "some"):
+        there = moved(T, getattr(walkers, name))
+        assert getattr(walkers.moved(T), name) == pytest.approx(there, abs=1e-12)
+
+
+def test_a_walk_on_a_wider_surface_than_the_source_reaches_ends_at_the_same_place() -> None:
+    rng = np.random.default_rng(9)
+    target, source = yard(rng), yard(rng)
+    far = moved(rigid(300.0, 40.0, 20.0, 0.5), yard(rng))
+    start = turned((0.4, -0.3, 0.6), (0.3, 0.2, -0.1))
+    walkers = choose_walkers(source, CELL)
+    ways = [
+        walk(find_surface(thin(xyz, walking_voxel(CELL)), 0.2), walkers, start, cell=CELL)
+        for xyz in (target, np.concatenate([target, far]))
+    ]
+    one, other = (way.arrived().T_target_source for way in ways)
+    assert one == pytest.approx(other, abs=1e-9)
+    metres, degrees = apart(one, np.eye(4), source)
+    assert metres < 0.03
+    assert degrees < 0.1
+    # and the finest points go on from there
+    settled = settle(ways[1], np.concatenate([target, far]), source)
+    assert settled.converged and settled.settled is not None
+    metres, degrees = apart(settled.T_target_source, np.eye(4), source)
+    assert metres < 0.005
+    assert degrees < 0.02
 
 
 def test_leaving_the_basin_gives_the_start_back() -> None:

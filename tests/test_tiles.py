@@ -327,6 +327,9 @@ def test_a_tile_holds_no_more_than_planned(
     size = find_length(shape[0]), find_length(shape[1])
     planned = bytes_held(size, sweep.side, 3, shared=shared, workers=1, n_targets=n_targets)
     assert planned <= plan.n_bytes <= 1.2 * planned
+    alone = bytes_held(size, sweep.side, 3, shared=shared, workers=1)
+    layers = (4 if shared else 6) * (16 if double else 8) * size[0] * size[1]
+    assert planned - alone >= (n_targets - 1) * layers
     search_tile(task)  # compiled
     arrays._own.__dict__.clear()
     tracemalloc.start()
