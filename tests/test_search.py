@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from commonmap.matching.search import (
     SearchPlan,
     evidence_at,
     plan_glance,
+    plan_part,
     plan_search,
     search,
     separate,
@@ -219,6 +221,15 @@ def test_the_plan_keeps_sixteen_cells_and_its_budget() -> None:
     assert extent / poor.cells[0] >= 15
     assert poor.n_yaw < rich.n_yaw
     assert len(poor.keep) == len(poor.cells)
+    assert poor.n_yaw % 8 == rich.n_yaw % 8 == 0  # as many as go side by side
+    # a part is searched on the cells of the whole, in as many yaws as its own rim needs
+    few = draft.known.copy()
+    few[draft.shape[0] // 3 :] = 0
+    part = plan_part(rich, replace(draft, known=few, occupied=draft.occupied & few), keep=64)
+    assert part.cells == rich.cells
+    assert part.keep == (64,)
+    assert part.n_yaw % 8 == 0
+    assert part.n_yaw < rich.n_yaw
 
 
 def test_the_pose_of_a_peak_by_hand() -> None:
