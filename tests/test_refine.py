@@ -160,6 +160,20 @@ def test_a_walk_on_a_wider_surface_than_the_source_reaches_ends_at_the_same_plac
     assert degrees < 0.02
 
 
+def test_a_walk_over_nothing_arrives_nowhere() -> None:
+    rng = np.random.default_rng(10)
+    start = rigid(400.0, 0.0, 0.0, 0.3)
+    surface = find_surface(thin(yard(rng), 0.2), 0.2)
+    way = walk(surface, choose_walkers(yard(rng), CELL), start, cell=CELL)
+    assert way.pairs is None
+    for refined in (way.arrived(), settle(way, yard(rng), yard(rng))):
+        assert not refined.converged
+        assert refined.settled is None
+        assert refined.rms == math.inf
+        assert refined.T_target_source == pytest.approx(start, abs=1e-9)
+        assert np.array_equal(refined.covariance, np.eye(6))
+
+
 def test_leaving_the_basin_gives_the_start_back() -> None:
     # 14 deg off: the registration finds the way, but that is not the pose that was searched
     rng = np.random.default_rng(5)

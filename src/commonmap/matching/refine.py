@@ -169,12 +169,15 @@ class Walk:
     surface: Surface
 
     def refined(self, T: Float64s, pairs: Pairs | None, settled: Settled | None = None) -> Refined:
-        """Return the answer, T (4, 4) from the start about the centre."""
+        """Return the answer, T (4, 4) from the start about the centre.
+
+        Where nothing is within reach of the source, it has not come to stay.
+        """
         shift = float(np.linalg.norm(T[:3, 3]))
         turn = float(Rotation.from_matrix(T[:3, :3]).magnitude())
         radius = 0.5 * float(np.linalg.norm((self.high - self.low)[:2]))
         most = max(math.radians(3.0), 4.0 * self.cell / radius)
-        stayed = shift <= 3.0 * self.cell and turn <= most
+        stayed = pairs is not None and shift <= 3.0 * self.cell and turn <= most
         if not stayed:
             T = np.eye(4)
         to_centre = from_rotation(np.eye(3), self.centre)
