@@ -34,7 +34,7 @@ import scipy
 from numpy.typing import NDArray
 
 from commonmap.config import ComputeConfig
-from commonmap.matching.search import Peaks, plan_search, search
+from commonmap.matching.search import Peaks, plan_search, search_both
 from commonmap.matching.slabs import SlabGrid
 
 RECORD = Path(__file__).parent / "records" / "large_base.json"
@@ -136,26 +136,20 @@ def measure(side: float, memory_gb: float, workers: int) -> dict[str, Any]:
         (folder / "small").mkdir()
         draft, small = make_draft(), make_base(100.0, folder / "small")
         compute = ComputeConfig(memory_gb=memory_gb)
-        search(small, draft, min_overlap=0.1, workers=workers, compute=compute)  # compile
+        search_both(small, draft, min_overlap=0.1, workers=workers, compute=compute)  # compile
         base = make_base(side, folder)
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         plan = plan_search(base, draft)
-        times, found = [], []
-        for mirrored in (False, True):
-            wall, cpu = time.perf_counter(), time.process_time()
-            found.append(
-                search(base, draft, min_overlap=0.1, mirrored=mirrored, workers=workers,
-                       compute=compute)
-            )  # fmt: skip
-            times.append((time.process_time() - cpu, time.perf_counter() - wall))
+        wall, cpu = time.perf_counter(), time.process_time()
+        found = search_both(base, draft, min_overlap=0.1, workers=workers, compute=compute)
+        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     at = found[0].T_target_source()
     turned = math.remainder(math.atan2(at[1, 0], at[0, 0]) - YAW, 2 * math.pi)
     return {
         "side_m": side, "cells": int(np.prod(base.shape)), "memory_gb": memory_gb,
         "workers": workers, "coarse_to_fine_m": plan.cells, "n_yaw": plan.n_yaw,
-        "search_cpu_s": times[0][0], "decoy_cpu_s": times[1][0],
-        "search_wall_s": times[0][1], "decoy_wall_s": times[1][1],
+        "cpu_s": cpu, "wall_s": wall,
         "peak_mb_before": before / 1024, "peak_mb": peak / 1024,
         "error_m": float(np.hypot(*at[:2, 3])), "error_deg": abs(math.degrees(turned)),
         "best": float(found[0].score[0]), "second": float(found[0].score[1]),
@@ -189,7 +183,7 @@ def draw() -> None:
 
     records = [r for r in json.loads(RECORD.read_text())["records"] if r["memory_gb"] != LITTLE]
     area = np.array([r["side_m"] ** 2 for r in records]) / 1e6
-    cpu = np.array([r["search_cpu_s"] + r["decoy_cpu_s"] for r in records])
+    cpu = np.array([r["cpu_s"] for r in records])
     n = np.array([r["cells"] for r in records], float)
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.6), constrained_layout=True)
     left.loglog(area, cpu, "o-", label="search and decoy")
