@@ -9,10 +9,10 @@ import pytest
 
 from commonmap.config import ComputeConfig
 from commonmap.matching.climb import HERE, climb_all, starts_around
+from commonmap.matching.levels import find_level
 from commonmap.matching.planes import pack_planes, turn_planes
 from commonmap.matching.search import evidence_at
 from commonmap.matching.slabs import Columns, SlabGrid, list_columns, pack_slabs
-from commonmap.matching.tiles import find_level
 from commonmap.types import Bools, Float64s
 
 CELL = 0.5

@@ -20,8 +20,9 @@ LAYERS = (
     ("sim",),
     ("pipeline", "pipeline_logs", "demo"),
     (
-        "study", "report", "cli", "cli_beside", "cli_logs", "cli_octree", "cli_options",
-        "cli_progress", "cli_results", "cli_study", "cli_words", "__init__", "__main__",
+        "study", "report", "cli", "cli_beside", "cli_logs", "cli_mapping", "cli_matching",
+        "cli_octree", "cli_options", "cli_progress", "cli_results", "cli_simulating", "cli_study",
+        "cli_words", "__init__", "__main__",
     ),
 )  # fmt: skip
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}

@@ -21,6 +21,7 @@ from commonmap.errors import InputError, MissingExtraError
 from commonmap.matching import arrays, tiles
 from commonmap.matching.evidence_fft import bytes_held, evidence_surface, transform_target
 from commonmap.matching.lane_fft import find_length
+from commonmap.matching.levels import find_level
 from commonmap.matching.peaks import local_maxima
 from commonmap.matching.search import Peaks, plan_search, search, search_both
 from commonmap.matching.slabs import (
@@ -39,7 +40,6 @@ from commonmap.matching.tiles import (
     Task,
     Tile,
     TilePlan,
-    find_level,
     find_turned_rim,
     plan_tiles,
     search_tile,

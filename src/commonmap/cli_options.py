@@ -1,11 +1,14 @@
-"""The arguments and options that several commands share."""
+"""The arguments and options that several commands share, and the configuration they make."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from commonmap.config import Config
 
 Base = Annotated[
     Path, typer.Argument(metavar="BASE", help="The map whose frame stays (the drone's).")
@@ -65,3 +68,27 @@ Scheduler = Annotated[
     typer.Option(metavar="tcp://HOST:PORT", help="Search on the workers of a Dask scheduler."),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
+
+
+def read_settings(
+    file: Path | None, metric: str | None, max_height: float | None, resolution: float | None,
+    level: str | None, seed: int | None, scheduler: str | None = None,
+    area: float | None = None, rays: bool = False,
+) -> Config:  # fmt: skip
+    """Return the configuration of a file with the options of the command line on top."""
+    from dataclasses import replace
+
+    from commonmap.config import Config, read_config
+
+    config = (read_config(file) if file is not None else Config()).with_values(
+        grid={"resolution": resolution, "max_height": max_height, "rays": rays or None},
+        level={"mode": level},
+        search={"metric": metric},
+        areas={"size": area},
+        compute={"scheduler": scheduler},
+    )
+    if metric is not None:
+        from commonmap.metrics.table import find_metric
+
+        find_metric(metric)
+    return config if seed is None else replace(config, seed=seed)

@@ -1,7 +1,8 @@
-"""How a command says where it is: a moving line on a terminal, else plain lines, or nothing."""
+"""How a command says where it is and what it noted: a moving line on a terminal, or plain lines."""
 
 from __future__ import annotations
 
+import logging
 import sys
 import threading
 import time
@@ -60,3 +61,27 @@ def _moving() -> Iterator[Progress]:
             bars.update(tasks[me], description=step, completed=share)
 
         yield tell
+
+
+@contextmanager
+def noting(quiet: bool) -> Iterator[None]:
+    """Print what readers note about a file (points left out, units) as lines on stderr."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("note: %(message)s"))
+    told: set[str] = set()
+
+    def is_new(record: logging.LogRecord) -> bool:
+        # A log is read twice: once for the way, once for the map
+        text = record.getMessage()
+        fresh = text not in told
+        told.add(text)
+        return fresh
+
+    handler.addFilter(is_new)
+    logger = logging.getLogger("commonmap")
+    handler.setLevel(logging.ERROR if quiet else logging.INFO)
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)

@@ -10,6 +10,10 @@ if TYPE_CHECKING:
     from commonmap.types import Match
 
 
+REFUSED = 3
+"""Exit code of a match that was refused."""
+
+
 def say_errors(name: str, errors: TrajectoryErrors) -> None:
     """Print how far a trajectory is from the truth."""
     print(

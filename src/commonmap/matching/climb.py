@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from commonmap.matching.evidence import sum_table, weigh, xlogx_table
+from commonmap.matching.levels import Level
 from commonmap.matching.planes import Words, count_planes, pack_planes, turn_planes
 from commonmap.matching.slabs import Columns, SlabGrid, is_shared
 from commonmap.matching.threads import in_order
-from commonmap.matching.tiles import Level
 from commonmap.types import Float64s
 
 MOST_STEPS = 12

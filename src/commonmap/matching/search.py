@@ -20,12 +20,11 @@ from commonmap.frames import from_xyz_yaw
 from commonmap.matching.climb import HERE, climb_all, starts_around
 from commonmap.matching.evidence import count_tables, sum_table, weigh, xlogx_table
 from commonmap.matching.lanes import WIDTH
+from commonmap.matching.levels import Level, find_level
 from commonmap.matching.slabs import Columns, SlabGrid, coarsen, is_shared, list_columns
 from commonmap.matching.tiles import (
-    Level,
     Sweep,
     circle,
-    find_level,
     find_turned_rim,
     plan_tiles,
     search_tiles,
