@@ -222,7 +222,7 @@ def _family_cell(rows: list[Record]) -> str:
 
 def _per_right(seconds: list[float], n_right: int) -> str:
     """Return the time of all pairs over the answers that were accepted and right."""
-    return f"{sum(seconds) / n_right:.1f}" if n_right else "-"
+    return f"{sum(seconds) / n_right:.2f}" if n_right else "-"
 
 
 def settings_table(peers: dict[str, list[Record]]) -> list[str]:
