@@ -8,7 +8,7 @@ each side, metres, at 2 m cells:
 evidence: the peaks of a 60 x 60 m draft of six slabs at all translations and so many yaws, as the
 search asks for them (`evidence_peaks`), on one thread of the CPU, on two, and on CuPy.
 k: the K divergence of all translations at 16 of these yaws, height maps of the same size.
-search: the whole search of `large_base.py`, of the draft and its mirror image, its pyramid and climbs
+search: the whole search of `large_base.py`, of the draft and its mirror image, pyramid and climbs
 included, on two threads and with CuPy for the exhaustive part; two threads feed the device.
 
 The first run of each is not counted. Peaks and searches must agree to the bit, the K divergence to
