@@ -47,12 +47,12 @@ class Level:
 
     def window(self, rows: Range, columns: Range) -> SlabGrid:
         """Return these cells of the level, which must lie in it."""
-        if self.whole is None and self.mirrored:
+        if self.whole is None:
+            if not self.mirrored:
+                return coarse_window(self.target, self.factor, rows, columns)
             n_x = self.shape[0]
             back = n_x - rows[1], n_x - rows[0]
             return mirror_grid(coarse_window(self.target, self.factor, back, columns))
-        if self.whole is None:
-            return coarse_window(self.target, self.factor, rows, columns)
         region = slice(*rows), slice(*columns)
         origin = self.origin + np.array([rows[0], columns[0]]) * self.cell
         occupied, known = (

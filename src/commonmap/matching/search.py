@@ -9,7 +9,7 @@ reaches (the decoy).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numba
@@ -183,11 +183,19 @@ def _search_sides(
     centre = _centre(list_columns(source))
     rungs = [_find_rung(target, source, cell, centre, min_overlap, compute) for cell in plan.cells]
 
+    ladders = [[rung.mirror() for rung in rungs] if mirrored else rungs for mirrored in sides]
+
     # Every pose at the coarsest cell; then each candidate climbs down the ladder
-    found = _search_all(rungs[0], sides, circle(plan.n_yaw), workers, compute, progress)
+    foot = [ladder[0] for ladder in ladders]
+    found = _search_all(foot, circle(plan.n_yaw), workers, compute, progress)
+    peaks = [
+        _descend(ladder, plan, *one, centre, n_peaks=n_peaks, workers=workers)
+        for ladder, one in zip(ladders, found, strict=True)
+    ]
+    back = np.array([-1.0, 1.0, -1.0])
     return [
-        _descend(rungs, plan, *one, centre, mirrored=mirrored, n_peaks=n_peaks, workers=workers)
-        for one, mirrored in zip(found, sides, strict=True)
+        replace(one, pose=one.pose * back) if mirrored else one
+        for one, mirrored in zip(peaks, sides, strict=True)
     ]
 
 
@@ -203,6 +211,10 @@ class Rung:
     n_known: int
     least_pairs: float
 
+    def mirror(self) -> Rung:
+        """Return the rung of the mirrored target."""
+        return replace(self, level=self.level.mirror())
+
 
 def _find_rung(
     target: SlabGrid, source: SlabGrid, cell: float, centre: Float64s, min_overlap: float,
@@ -217,7 +229,7 @@ def _find_rung(
 
 def _descend(
     rungs: list[Rung], plan: SearchPlan, pose: Float64s, score: Float64s, per_yaw: Float64s,
-    centre: Float64s, *, mirrored: bool, n_peaks: int, workers: int,
+    centre: Float64s, *, n_peaks: int, workers: int,
 ) -> Peaks:  # fmt: skip
     """Return the best of the coarsest cell's peaks (M, 3), on the finest cell."""
     finest = plan.cells[-1]
@@ -228,9 +240,8 @@ def _descend(
     # Each candidate climbs at this cell, then at half of it, and so on
     for n, (rung, cell) in enumerate(zip(rungs, plan.cells, strict=True)):
         yaw_step = step * cell / plan.cells[0] / 2.0
-        level = rung.level.mirror() if mirrored else rung.level
         climb = partial(
-            climb_all, level, rung.columns, yaw_step=yaw_step, least_pairs=rung.least_pairs,
+            climb_all, rung.level, rung.columns, yaw_step=yaw_step, least_pairs=rung.least_pairs,
             workers=workers,
         )  # fmt: skip
         pose, score, pairs = climb(pose, starts=starts_around(2, 1) if n > 0 else HERE)
@@ -247,9 +258,8 @@ def _descend(
         np.concatenate([new, old]) for new, old in zip(again, (pose, score, pairs), strict=True)
     )
     order = separate(pose, score, 4.0 * finest, 6.0 * yaw_step, n_peaks)
-    pose = pose[order] * np.array([-1.0, 1.0, -1.0] if mirrored else [1.0, 1.0, 1.0])
     overlap = np.minimum(pairs[order] / max(rungs[-1].n_known, 1), 1.0)
-    return Peaks(pose, score[order], overlap, centre, per_yaw, finest)
+    return Peaks(pose[order], score[order], overlap, centre, per_yaw, finest)
 
 
 @dataclass(frozen=True)
@@ -300,13 +310,13 @@ def centre_columns(columns: Columns, centre: Float64s) -> Columns:
 
 
 def _search_all(
-    rung: Rung, sides: tuple[bool, ...], yaws: Float64s, workers: int, compute: ComputeConfig,
-    progress: Progress,
+    rungs: list[Rung], yaws: Float64s, workers: int, compute: ComputeConfig, progress: Progress
 ) -> list[tuple[Float64s, Float64s, Float64s]]:  # fmt: skip
     """Return, of each side, the separate peaks of every yaw: poses (M, 3), scores (M,), per_yaw.
 
-    per_yaw: (n_yaw, 2) yaw and the best score at it. Poses are those of the side's own target.
+    rungs: of each side, of one size. per_yaw: (n_yaw, 2) yaw and the best score at it.
     """
+    rung = rungs[0]
     level, columns, cell = rung.level, rung.columns, rung.level.cell
     reach = float(np.hypot(*columns.xy.T).max())
     side = 2 * int(np.ceil(reach / cell)) + 2
@@ -319,9 +329,9 @@ def _search_all(
     shared = shared and is_shared(columns.known, columns.n_slabs)
     plan = plan_tiles(
         level.shape, side, columns.n_slabs, shared=shared, compute=compute, workers=at_once,
-        rim=rim, n_targets=len(sides),
+        rim=rim, n_targets=len(rungs),
     )  # fmt: skip
-    levels = tuple(level.mirror() if mirrored else level for mirrored in sides)
+    levels = tuple(rung.level for rung in rungs)
     found = search_tiles(
         levels, sweep, plan.tiles, compute=compute, workers=workers, progress=progress
     )
