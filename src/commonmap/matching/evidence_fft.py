@@ -198,11 +198,11 @@ def evidence_surfaces(
     borrowed (`arrays.borrow`): they last until this thread's next call.
     """
     least, table = math.ceil(min_overlap), xlogx_table(occupied.shape[0] * occupied.shape[1])
+    alike, standing = is_shared(known, target.n_slabs), find_standing(occupied, target.n_slabs)
     if target.arrays.name != "numpy":
-        shared = target.shared_known and is_shared(known, target.n_slabs)
-        standing = find_standing(occupied, target.n_slabs)
+        shared = target.shared_known and alike
         return evidence_device.score(target, occupied, known, shared, standing, least, table)
-    job = _plan_job(target, occupied, known)
+    job = _plan_job(target, alike, standing)
     products = _multiply(target, job, _transform(target, job, occupied, known))
     score = borrow(NUMPY, "evidence score", (occupied.shape[2], *target.shape), np.float32)
     overlap = borrow(NUMPY, "evidence overlap", score.shape, np.float32)
@@ -235,19 +235,21 @@ def peaks_on_each(
     min_overlap: float,
 ) -> list[list[Float64s]]:  # fmt: skip
     """Return the same on each of several targets of one size; the source is transformed once."""
+    answers = []
+    if targets[0].arrays.name != "numpy":
+        for target in targets:
+            score, _ = evidence_surfaces(target, occupied, known, min_overlap=min_overlap)
+            answers.append([_list_peaks(*local_maxima(one, n_peaks, 0.0, *rim)) for one in score])
+        return answers
     least, table = math.ceil(min_overlap), xlogx_table(occupied.shape[0] * occupied.shape[1])
+    n_slabs = targets[0].n_slabs
+    alike, standing = is_shared(known, n_slabs), find_standing(occupied, n_slabs)
     low_u, high_u, low_v, high_v = rim
     turned: Turned | None = None
-    answers = []
     for target in targets:
-        if target.arrays.name != "numpy":
-            score, _ = evidence_surfaces(target, occupied, known, min_overlap=min_overlap)
-            found = [local_maxima(one, n_peaks, 0.0, *rim) for one in score]
-            answers.append([_list_peaks(*one) for one in found])
-            continue
         n_u, n_v = target.shape
         own = (low_u, n_u - high_u, low_v, n_v - high_v)
-        job = _plan_job(target, occupied, known)
+        job = _plan_job(target, alike, standing)
         if turned is None or not turned.serves(target, job):
             turned = _transform(target, job, occupied, known)
         index, value = find_peaks(
@@ -269,13 +271,12 @@ def _list_peaks(index: NDArray[np.int64], value: Float32s) -> Float64s:
     return out[:n]
 
 
-def _plan_job(target: Spectra, occupied: Bits, known: Bits) -> Lanes:
-    """Return which lanes of turned sources and which products the target's counts need."""
-    if occupied.shape[2] > WIDTH:
-        raise ValueError(f"at most {WIDTH} yaws at a time; {occupied.shape[2]} came")
-    shared = target.shared_known and is_shared(known, target.n_slabs)
-    standing = find_standing(occupied, target.n_slabs)
-    return plan_lanes(standing, target.standing, shared, target.shared_known)
+def _plan_job(target: Spectra, alike: bool, standing: tuple[bool, ...]) -> Lanes:
+    """Return which lanes of turned sources and which products the target's counts need.
+
+    alike: whether the sources know all slabs alike. standing: which of the slabs hold anything.
+    """
+    return plan_lanes(standing, target.standing, target.shared_known and alike, target.shared_known)
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,6 +295,8 @@ class Turned:
 
 def _transform(target: Spectra, job: Lanes, occupied: Bits, known: Bits) -> Turned:
     """Return the spectra of turned sources, as the target needs them."""
+    if occupied.shape[2] > WIDTH:
+        raise ValueError(f"at most {WIDTH} yaws at a time; {occupied.shape[2]} came")
     n_x, n_y = target.fft_shape
     rows = borrow(NUMPY, "evidence rows", (n_y, occupied.shape[0] * STEP), target.dtype)
     lanes = borrow(NUMPY, "evidence lanes", (len(job.parts), n_y, n_x * STEP), target.dtype)
