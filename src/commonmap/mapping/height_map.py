@@ -170,6 +170,17 @@ def _used_bounds(xyz, height, limit):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[misc]
+def _slab_bit(height, edges):  # type: ignore[no-untyped-def]
+    """Return the bit of the slab that a height lies in, zero where it lies in none."""
+    if not edges[0] <= height < edges[-1]:
+        return np.uint32(0)
+    k = 0
+    while height >= edges[k + 1]:
+        k += 1
+    return np.uint32(1) << np.uint32(k)
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[misc]
 def _fill_columns(xyz, height, limit, origin, cell, n_x, n_y, edges):  # type: ignore[no-untyped-def]
     count = np.zeros((n_x, n_y), np.int32)
     top = np.full((n_x, n_y), np.nan)
@@ -188,11 +199,7 @@ def _fill_columns(xyz, height, limit, origin, cell, n_x, n_y, edges):  # type: i
             lowest[i, j] = xyz[n, 2]
         if not highest[i, j] >= xyz[n, 2]:
             highest[i, j] = xyz[n, 2]
-        if height[n] >= edges[0] and height[n] < edges[-1]:
-            k = 0
-            while height[n] >= edges[k + 1]:
-                k += 1
-            bits[i, j] |= np.uint32(1) << np.uint32(k)
+        bits[i, j] |= _slab_bit(height[n], edges)
     return count, top, lowest, highest, bits
 
 
@@ -208,9 +215,5 @@ def _fill_slabs(xyz, height, limit, origin, cell, n_x, n_y, edges):  # type: ign
         i = min(int((xyz[n, 0] - origin[0]) / cell), n_x - 1)
         j = min(int((xyz[n, 1] - origin[1]) / cell), n_y - 1)
         known[i, j] = full
-        if h >= edges[0] and h < edges[-1]:
-            k = 0
-            while h >= edges[k + 1]:
-                k += 1
-            occupied[i, j] |= np.uint32(1) << np.uint32(k)
+        occupied[i, j] |= _slab_bit(h, edges)
     return occupied, known

@@ -17,7 +17,7 @@ from commonmap.matching.peaks import local_maxima
 from commonmap.matching.search import Peaks, count_yaws, separate
 from commonmap.matching.slabs import turned_cell
 from commonmap.matching.threads import in_order
-from commonmap.matching.tiles import N_PEAKS
+from commonmap.matching.tiles import N_PEAKS, circle
 from commonmap.metrics.plans import DifferenceSum, JointHistogram, MinSum, Smooth
 from commonmap.metrics.table import find_metric
 from commonmap.types import Float64s, GridMap, Progress, no_progress
@@ -72,7 +72,7 @@ def search_metric(
     low = np.full(2, -0.5 * side * cell)
     _, known_0 = scatter_heights(xy, height, 1.0, 0.0, cell, low, side, side)
     n_known = int(np.count_nonzero(known_0))
-    yaws = 2.0 * np.pi * np.arange(n_yaw) / n_yaw
+    yaws = circle(n_yaw)
     min_cells = max(4, int(min_overlap * n_known))
     turned = (
         scatter_heights(xy, height, float(np.cos(t)), float(np.sin(t)), cell, low, side, side)[1]

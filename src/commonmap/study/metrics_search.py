@@ -20,6 +20,7 @@ from commonmap.matching.slabs import (
     pack_slabs,
     scatter,
 )
+from commonmap.matching.tiles import circle
 from commonmap.study.metrics_kernels import best_peaks, vertex
 from commonmap.study.metrics_scores import COLUMNS, prepare, score_all
 from commonmap.types import Float64s, GridMap
@@ -92,7 +93,7 @@ def search_all(
     _, unturned = scatter_heights(xy, height, 1.0, 0.0, cell, low, side, side)
     n_known = int(np.count_nonzero(unturned))
     n_yaw = count_yaws(float(np.quantile(np.hypot(*xy.T), 0.98)), cell)
-    yaws = 2.0 * np.pi * np.arange(n_yaw) / n_yaw
+    yaws = circle(n_yaw)
 
     # 1. the target on the cells of the search, and its half of all sums
     slabs_t = pack_slabs(target.origin, target.cell, target["slab_occupied"], target["slab_known"])
